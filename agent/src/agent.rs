@@ -45,7 +45,7 @@ pub(crate) struct EncodedSweep {
 #[derive(Debug)]
 pub struct Agent {
     cav: CavId,
-    pose_source: Box<dyn PoseSource>,
+    pub(crate) pose_source: Box<dyn PoseSource>,
     detector: Option<Detector>,
     object_tracker: Tracker,
     /// Falsifies everything that is published.
@@ -224,11 +224,6 @@ impl Agent {
             Some(attack) => attack.boxes(boxes),
             None => boxes,
         }
-    }
-
-    /// Number of poses so far that the vehicle cannot have reached from the previous ones.
-    pub(crate) fn pose_jumps(&self) -> u64 {
-        self.pose_source.jumps()
     }
 
     /// Feature map, confidence and own detections of a sweep by itself.

@@ -6,7 +6,7 @@ use anyhow::Context;
 use bus::BusError;
 use bus::malloc_settings;
 use clap::{Parser, Subcommand};
-use support::cli::{Outcome, exit_code};
+use support::cli::exit_code;
 use support::command_line::parse_beside;
 use support::sibling_program::Sibling;
 
@@ -50,22 +50,15 @@ enum Command {
     ReplayInputs(command::replay_inputs::Arguments),
 }
 
-impl Command {
-    fn run(self) -> anyhow::Result<Outcome> {
-        match self {
-            Self::Run(args) => {
-                // It may execute the program again, so it comes before everything else.
-                malloc_settings::ensure(&malloc_settings::KEPT_MEMORY)
-                    .context("cannot execute this program again")?;
-                command::run::run(*args)
-            }
-            Self::ReplayInputs(arguments) => arguments.run(),
-        }
-    }
-}
-
 /// Runs the subcommand on the command line.
 pub fn main() -> ExitCode {
     let command_line: CommandLine = parse_beside(&OFFLINE);
-    exit_code(command_line.command.run(), BusError::is_behind)
+    let outcome = match command_line.command {
+        // It may execute the program again, so it comes before everything else.
+        Command::Run(args) => malloc_settings::ensure(&malloc_settings::KEPT_MEMORY)
+            .context("cannot execute this program again")
+            .and_then(|()| command::run::run(*args)),
+        Command::ReplayInputs(arguments) => arguments.run(),
+    };
+    exit_code(outcome, BusError::is_behind)
 }

@@ -10,10 +10,11 @@
 //! `operate` uses `score`; `report` and `view` use both, `ros` none.
 //!
 //! ```
-//! use deploy::operate::status::{RunStatus, StatusError};
+//! use deploy::operate::status::RunStatus;
 //!
 //! let folder = std::env::temp_dir().join(format!("v2vloc-runs-{}", std::process::id()));
-//! assert!(matches!(RunStatus::newest(&folder), Err(StatusError::NoRun(_))));
+//! let error = RunStatus::newest(&folder).unwrap_err();
+//! assert_eq!(error.to_string(), format!("there is no run in {}", folder.display()));
 //! ```
 
 #![warn(clippy::print_stdout, clippy::print_stderr)]

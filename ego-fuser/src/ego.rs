@@ -43,15 +43,6 @@ const MAP_LAG_NANOS: i64 = 100_000_000;
 /// ego's own. On validation scenes a sender has at most 6 more.
 const MORE_BOXES: usize = 32;
 
-/// Reason why a neighbour is not in a result.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Skipped {
-    /// The method exchanges nothing.
-    NotNeeded,
-    /// Its message cannot be used, or its sender is out of range.
-    Unusable(DropReason),
-}
-
 /// One frame's result.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct EgoOutput {
@@ -59,8 +50,9 @@ pub struct EgoOutput {
     pub detections: Vec<Detection>,
     /// Indices of the neighbours that are in it.
     pub fused: Vec<usize>,
-    /// The other neighbours, each with its reason.
-    pub skipped: Vec<(usize, Skipped)>,
+    /// The other neighbours, each with the reason why its message cannot be used, out of range included; `None`: the method
+    /// exchanges nothing.
+    pub skipped: Vec<(usize, Option<DropReason>)>,
     /// Assessment of each neighbour that could be fused; empty without misbehaviour detection.
     pub beliefs: Vec<(usize, Assessment)>,
     /// Boxes of neighbours beyond the limit, which were not read.
@@ -249,12 +241,10 @@ impl Ego {
     /// frame are not valid ([`EgoError::is_of_frame`]).
     pub fn detect(&mut self, own: &View, neighbours: &[View]) -> Result<EgoOutput, EgoError> {
         let needed = self.method.own_content();
-        if own.content.exchange() != needed {
-            return Err(EgoError::OwnContent {
-                method: self.method,
-                needed,
-                found: own.content.exchange(),
-            });
+        let (method, found) = (self.method, own.content.exchange());
+        if found != needed {
+            let problem = format!("{method} needs the ego's own {needed:?}, not {found:?}");
+            return Err(EgoError::OwnContent(problem));
         }
         self.history.advance(own.capture_nanos);
         if let Some(compensation) = &mut self.compensation {
@@ -335,18 +325,18 @@ impl Ego {
         choice
     }
 
-    /// Pose of a neighbour relative to the ego, or the reason why it is left out.
-    fn align(&self, own: &View, view: &View) -> Result<Pose, Skipped> {
+    /// Pose of a neighbour relative to the ego, or the reason why it is left out, `None` if the method exchanges nothing.
+    fn align(&self, own: &View, view: &View) -> Result<Pose, Option<DropReason>> {
         if self.method.exchange() == Exchange::Nothing {
-            return Err(Skipped::NotNeeded);
+            return Err(None);
         }
-        let no_pose = Skipped::Unusable(DropReason::NoPose);
+        let no_pose = Some(DropReason::NoPose);
         let world_from_ego = own.pose.world_from_cav().ok_or(no_pose)?;
         let world_from_cav = view.pose.world_from_cav().ok_or(no_pose)?;
         let [dx, dy] = [0, 1]
             .map(|axis| world_from_cav.translation_m[axis] - world_from_ego.translation_m[axis]);
         if dx.hypot(dy) > self.comm_range_m {
-            return Err(Skipped::Unusable(DropReason::OutOfRange));
+            return Err(Some(DropReason::OutOfRange));
         }
         let fits = match (&own.content, &view.content) {
             (Content::Features(_), Content::Features(map)) => self.is_own_shape(map),
@@ -354,7 +344,7 @@ impl Ego {
             (own, other) => own.exchange() == other.exchange(),
         };
         if !fits {
-            return Err(Skipped::Unusable(DropReason::Shape));
+            return Err(Some(DropReason::Shape));
         }
         Ok(world_from_ego.from_world(world_from_cav))
     }
@@ -457,12 +447,11 @@ impl Ego {
     fn tensors(&self, map: &DecodedFeatures, is_ego: bool) -> Result<(Tensor, Tensor), EgoError> {
         let [channels, height, width] = self.detector.sent_shape();
         if !self.is_own_shape(map) {
-            return Err(EgoError::OwnMap {
-                channels: map.features.channels,
-                found: map.features.grid,
-                expected_channels: channels,
-                expected: self.detector.grid(),
-            });
+            let (found, own) = (&map.features, self.detector.grid());
+            return Err(EgoError::OwnMap(format!(
+                "{} x {}, the network's is {channels} x {own}",
+                found.channels, found.grid
+            )));
         }
         let sent = match &map.sent {
             Some(sent) if !is_ego => Tensor::f_from_slice(sent)?.f_to_kind(Kind::Float)?,
@@ -606,7 +595,7 @@ struct ChosenViews<'a> {
     /// Indices of the neighbours that are fused.
     fused: Vec<usize>,
     /// The others, each with its reason.
-    skipped: Vec<(usize, Skipped)>,
+    skipped: Vec<(usize, Option<DropReason>)>,
 }
 
 impl ChosenViews<'_> {
@@ -618,7 +607,7 @@ impl ChosenViews<'_> {
         self.aligned.retain(|_| marks.next() == Some(&false));
         let mut marks = is_out.iter();
         let left_out = self.fused.extract_if(.., |_| marks.next() != Some(&false));
-        let skipped = left_out.map(|index| (index, Skipped::Unusable(reason)));
+        let skipped = left_out.map(|index| (index, Some(reason)));
         self.skipped.extend(skipped);
     }
 }

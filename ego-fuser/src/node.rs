@@ -57,13 +57,6 @@ pub struct NodeOptions {
     pub inputs: Option<InputFile>,
 }
 
-impl Default for NodeOptions {
-    /// The settings' defaults, all neighbours.
-    fn default() -> Self {
-        Self::from(&EgoSettings::default())
-    }
-}
-
 impl From<&EgoSettings> for NodeOptions {
     /// All neighbours, received directly, until the own agent ends.
     fn from(settings: &EgoSettings) -> Self {
@@ -358,9 +351,10 @@ impl<'a> EgoNode<'a> {
     /// Records an input without a message, hands it to the loop and carries out what that decides.
     fn handle(&mut self, input: Input) {
         let now_nanos = self.clock.now_nanos();
-        // Before the decision and with the time of it, so that a replay decides the same.
+        // Before the decision and with the time of it, so that a replay decides the same. A message is recorded as it is on
+        // the wire, where it is decoded.
         if let Some(log) = &self.log
-            && let Some(input) = input.without_message()
+            && let Ok(input) = input.clone().try_map(|_| Err(()))
         {
             log.add(&EgoRecord::Input { now_nanos, input });
         }
@@ -388,8 +382,7 @@ impl<'a> EgoNode<'a> {
                     capture_nanos,
                     error,
                 } => tracing::error!(capture_nanos, "a frame could not be fused: {error}"),
-                Output::Received(source) => self.account(&source, None, now_nanos),
-                Output::Dropped(source, reason) => self.account(&source, Some(reason), now_nanos),
+                Output::Counted(source, reason) => self.account(&source, reason, now_nanos),
                 Output::Pace(pace) => self.pace.submit(0, pace),
             }
         }

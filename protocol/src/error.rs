@@ -98,14 +98,9 @@ pub enum WireError {
         /// Size found.
         found: u64,
     },
-    /// The grid is not the agreed one.
-    #[error("feature map has the grid {found}, expected {expected}")]
-    Grid {
-        /// The agreed grid.
-        expected: String,
-        /// Grid of the message.
-        found: String,
-    },
+    /// The grid is not the agreed one: that of the message and the agreed one.
+    #[error("feature map has the grid {0}")]
+    Grid(String),
     /// A number that is NaN, infinite or beyond its bounds.
     #[error("{what}[{index}] is {value}, not a number within {min}..={max}")]
     Value {
@@ -128,16 +123,10 @@ pub enum WireError {
         /// Error of the pose.
         source: InvalidPose,
     },
-    /// A compressed body that does not decompress to the announced size.
-    #[error("compressed body of {bytes} bytes, {expected} unpacked: {detail}")]
-    Compression {
-        /// Compressed size.
-        bytes: u64,
-        /// Size that shape and codec require of the decompressed body.
-        expected: u64,
-        /// Error text of the decoder.
-        detail: String,
-    },
+    /// A compressed body that does not decompress to the announced size: its size, the size that shape and codec require of
+    /// the decompressed body, and the error text of the decoder.
+    #[error("compressed body of {0}")]
+    Compression(String),
     /// A byte budget that cannot hold the parts of an empty selection.
     #[error("budget of {budget} bytes cannot hold scales and cell mask, which take {needed}")]
     Budget {

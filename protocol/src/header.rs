@@ -185,11 +185,8 @@ fn cav_from_wire(len: u8, field: &[u8; CavId::MAX_LEN]) -> Result<CavId, WireErr
     let (name, padding) = field.split_at(usize::from(len).min(field.len()));
     let text = String::from_utf8_lossy(name);
     if usize::from(len) > field.len() || padding.iter().any(|byte| *byte != 0) {
-        return Err(WireError::Cav(IdError::Malformed {
-            kind: "CAV id",
-            text: text.into_owned(),
-            max_len: CavId::MAX_LEN,
-        }));
+        let error = IdError::malformed("CAV id", &text, CavId::MAX_LEN);
+        return Err(WireError::Cav(error));
     }
     CavId::new(&text).map_err(WireError::Cav)
 }

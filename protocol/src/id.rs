@@ -6,6 +6,7 @@ use std::str::FromStr;
 use serde::{Deserialize, Serialize};
 
 use crate::string_enum::written_as_text;
+use crate::text::excerpt;
 
 /// Reserved chunks at the position of a CAV in a key: a vehicle of that name would publish onto a key of another
 /// process.
@@ -14,50 +15,34 @@ const RESERVED_CAV_IDS: [&str; 6] = ["alive", "control", "ready", "rx", "stats",
 /// Error of a text that is not an identifier.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum IdError {
-    /// Empty, too long, or a character outside the alphabet.
-    #[error(
-        "{kind} {text:?} is not an identifier: 1 to {max_len} characters of a-z, 0-9, '_' and '-'"
-    )]
-    Malformed {
-        /// Kind of identifier.
-        kind: &'static str,
-        /// Beginning of the text.
-        text: String,
-        /// Longest identifier of this kind, bytes.
-        max_len: usize,
-    },
-    /// A word that has another meaning in keys.
-    #[error("{kind} {text:?} is a reserved word of the key space: one of {RESERVED_CAV_IDS:?}")]
-    Reserved {
-        /// Kind of identifier.
-        kind: &'static str,
-        /// The reserved word.
-        text: String,
-    },
+    /// Empty, too long, or a character outside the alphabet: the kind of identifier, the beginning of the text, and the
+    /// longest identifier of this kind, bytes.
+    #[error("{0} characters of a-z, 0-9, '_' and '-'")]
+    Malformed(String),
+    /// A word that has another meaning in keys: the kind of identifier and the word.
+    #[error("{0} is a reserved word of the key space: one of {RESERVED_CAV_IDS:?}")]
+    Reserved(String),
 }
 
-fn check(
-    kind: &'static str,
-    text: &str,
-    max_len: usize,
-    reserved: &[&str],
-) -> Result<Box<str>, IdError> {
+impl IdError {
+    pub(crate) fn malformed(kind: &str, text: &str, max_len: usize) -> Self {
+        let problem = format!("{kind} {text:?} is not an identifier: 1 to {max_len}");
+        Self::Malformed(problem)
+    }
+}
+
+fn check(kind: &str, text: &str, max_len: usize, reserved: &[&str]) -> Result<Box<str>, IdError> {
     let is_valid = (1..=max_len).contains(&text.len())
         && text
             .bytes()
             .all(|byte| matches!(byte, b'a'..=b'z' | b'0'..=b'9' | b'_' | b'-'));
     if !is_valid {
         // A hostile name must not fill the log.
-        let text = text.chars().take(2 * max_len).collect();
-        return Err(IdError::Malformed {
-            kind,
-            text,
-            max_len,
-        });
+        let text = excerpt(text, 2 * max_len);
+        return Err(IdError::malformed(kind, &text, max_len));
     }
     if reserved.contains(&text) {
-        let text = text.into();
-        return Err(IdError::Reserved { kind, text });
+        return Err(IdError::Reserved(format!("{kind} {text:?}")));
     }
     Ok(text.into())
 }

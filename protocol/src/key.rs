@@ -37,20 +37,14 @@ pub enum KeyError {
     /// Wildcards, in a text with this beginning, name many keys, a message has one.
     #[error("{0:?} holds a wildcard")]
     Wildcard(String),
-    /// A chunk of the key is not an identifier.
-    #[error("key {text:?}: {source}")]
-    Id {
-        /// The beginning of the key.
-        text: String,
-        /// Error of the chunk.
-        source: IdError,
-    },
+    /// A chunk of the key is not an identifier: the beginning of the key, and the error of the chunk.
+    #[error("key {0}")]
+    Id(String),
 }
 
 impl KeyError {
-    pub(crate) fn id(text: &str, source: IdError) -> Self {
-        let text = shown(text);
-        Self::Id { text, source }
+    pub(crate) fn id(text: &str, error: &IdError) -> Self {
+        Self::Id(format!("{:?}: {error}", shown(text)))
     }
 
     pub(crate) fn unknown(text: &str) -> Self {
@@ -106,7 +100,7 @@ impl FromStr for Key {
             return Err(KeyError::unknown(text));
         };
         let topic = topic.parse()?;
-        let run = RunId::new(run).map_err(|source| KeyError::id(text, source))?;
+        let run = RunId::new(run).map_err(|error| KeyError::id(text, &error))?;
         Ok(Self { run, topic })
     }
 }

@@ -17,16 +17,10 @@ pub enum InvalidPose {
     /// The quaternion does not have length one.
     #[error("pose quaternion has length {0}, not 1")]
     NotUnit(f64),
-    /// The rotation part of a matrix is not orthonormal or mirrors.
-    #[error(
-        "pose matrix is not a rotation: largest deviation from orthonormality {deviation:.2e}, determinant {determinant:.6}"
-    )]
-    NotRotation {
-        /// Largest absolute entry of `R * R^T - I`.
-        deviation: f64,
-        /// Determinant of the rotation part.
-        determinant: f64,
-    },
+    /// The rotation part of a matrix is not orthonormal or mirrors: the largest absolute entry of `R * R^T - I`, and its
+    /// determinant.
+    #[error("pose matrix is not a rotation: {0}")]
+    NotRotation(String),
     /// The last row of a 4x4 matrix is not `0 0 0 1`.
     #[error("pose matrix ends in the row {0:?}, not 0 0 0 1")]
     LastRow([f64; 4]),
@@ -77,10 +71,9 @@ impl Pose {
         let determinant = rotation.determinant();
         // Orthonormal with a negative determinant is a mirror, as from left-handed axes.
         if deviation > UNIT_TOLERANCE || determinant < 0.0 {
-            return Err(InvalidPose::NotRotation {
-                deviation,
-                determinant,
-            });
+            return Err(InvalidPose::NotRotation(format!(
+                "largest deviation from orthonormality {deviation:.2e}, determinant {determinant:.6}"
+            )));
         }
         let rotation =
             UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(rotation));

@@ -176,7 +176,7 @@ impl FromStr for Topic {
         let chunks: Vec<&str> = text.split('/').collect();
         Self::from_chunks(&chunks)
             .ok_or_else(|| KeyError::unknown(text))?
-            .map_err(|source| KeyError::id(text, source))
+            .map_err(|error| KeyError::id(text, &error))
     }
 }
 

@@ -59,7 +59,7 @@ fn icp(criterion: &mut Criterion) {
     assert!(off.translation.vector.norm() < 0.1, "{off}");
     eprintln!(
         "{} points on {} planes, {} steps",
-        decimate.points_m().len(),
+        decimate.points_m.len(),
         planes.planes(),
         fit.steps
     );

@@ -150,7 +150,7 @@ impl MapRegistration {
         if !localizer.is_calibrated() {
             surfels.covariance_scale = None;
         }
-        match (localizer.place(), surfels.place()) {
+        match (localizer.place(), surfels.place.as_str()) {
             (Some(head), place) if !place.is_empty() && place != head => {
                 let problem = format_args!("a surfel map of {place:?}, the head is of {head:?}");
                 Err(FileError::new(map, problem))

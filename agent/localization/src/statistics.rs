@@ -5,7 +5,17 @@ use support::statistics::mean;
 /// Spearman's rank correlation of paired samples, equal values sharing their mean rank; `None` when one of them does
 /// not vary, or there are fewer than two pairs.
 pub fn spearman(a: &[f64], b: &[f64]) -> Option<f64> {
-    pearson(&ranks(a), &ranks(b))
+    if a.len() != b.len() || a.len() < 2 {
+        return None;
+    }
+    let [a, b] = [a, b].map(ranks);
+    let (mean_a, mean_b) = (mean(&a)?, mean(&b)?);
+    let [mut ab, mut aa, mut bb] = [0.0; 3];
+    for (a, b) in a.iter().zip(&b) {
+        let (a, b) = (a - mean_a, b - mean_b);
+        (ab, aa, bb) = (ab + a * b, aa + a * a, bb + b * b);
+    }
+    (aa > 0.0 && bb > 0.0).then(|| ab / (aa * bb).sqrt())
 }
 
 /// Upper 95 % confidence limit of a share of which `count` of `all` were seen (Clopper and Pearson 1934); 1 of none.
@@ -45,19 +55,6 @@ fn ranks(values: &[f64]) -> Vec<f64> {
         place += equal.len();
     }
     ranks
-}
-
-fn pearson(a: &[f64], b: &[f64]) -> Option<f64> {
-    if a.len() != b.len() || a.len() < 2 {
-        return None;
-    }
-    let (mean_a, mean_b) = (mean(a)?, mean(b)?);
-    let [mut ab, mut aa, mut bb] = [0.0; 3];
-    for (a, b) in a.iter().zip(b) {
-        let (a, b) = (a - mean_a, b - mean_b);
-        (ab, aa, bb) = (ab + a * b, aa + a * a, bb + b * b);
-    }
-    (aa > 0.0 && bb > 0.0).then(|| ab / (aa * bb).sqrt())
 }
 
 #[cfg(test)]

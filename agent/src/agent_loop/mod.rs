@@ -335,7 +335,7 @@ impl AgentLoop {
         self.publish(Stream::Pose, paired.capture_nanos, content);
         self.outputs.push(LoopOutput::Timed(times));
         self.note_pose(&pose, now_nanos);
-        self.report.pose_jumps = self.agent.pose_jumps();
+        self.report.pose_jumps = self.agent.pose_source.jumps();
         self.step = LoopStep::Perceive(paired, pose, sweep);
     }
 
@@ -350,8 +350,7 @@ impl AgentLoop {
             }
             PoseEstimate::NoPose { reason, .. } => {
                 self.report.no_pose += 1;
-                let reason = serde_json::to_string(reason).unwrap_or_default();
-                let reason = reason.trim_matches('"').replace('_', " ");
+                let reason = <&str>::from(reason).replace('_', " ");
                 (now_nanos.saturating_sub(last_nanos) > NO_POSE_NANOS)
                     .then(|| (format!("no pose: {reason}"), last_nanos))
             }

@@ -19,6 +19,8 @@ pub(crate) struct FrameLines {
     truth: BufWriter<File>,
     /// Created with the first tracks.
     tracks: Option<BufWriter<File>>,
+    /// Scenario of each frame so far, where there are several.
+    pub(crate) scenarios: Vec<String>,
     written: io::Result<()>,
 }
 
@@ -33,16 +35,19 @@ impl FrameLines {
             detections: create(folder, "detections.jsonl")?,
             truth: create(folder, "truth.jsonl")?,
             tracks: None,
+            scenarios: Vec::new(),
             written: Ok(()),
         })
     }
 
-    /// Adds a frame, with the name of its scenario where there are several; a break after an error.
+    /// Adds a frame, with the name of its scenario where there are several; a break after an error, which
+    /// [`Self::finish`] returns.
     pub(crate) fn add(
         &mut self,
         scenario: Option<&str>,
         frame: &EvaluatedFrame,
     ) -> ControlFlow<()> {
+        self.scenarios.extend(scenario.map(str::to_owned));
         if self.written.is_ok() {
             self.written = self.write(scenario, frame);
         }

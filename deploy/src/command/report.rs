@@ -31,7 +31,7 @@ impl Arguments {
     pub(crate) fn run(self) -> anyhow::Result<Outcome> {
         let newest = self.named.is_empty().then_some(None);
         let runs = self.named.iter().cloned().map(Some).chain(newest);
-        let folders = runs.map(|run| RunStatus::folder(run, &self.runs).map_err(BadInput::of));
+        let folders = runs.map(|run| RunStatus::folder(run, &self.runs));
         let folders = folders.collect::<Result<Vec<_>, _>>()?;
         if self.tracks {
             let reports = read(&folders, TrackReport::read)?;

@@ -36,7 +36,7 @@ impl WatchedRun {
 
     /// Folder of the run.
     pub(crate) fn folder(&self) -> Result<PathBuf, BadInput> {
-        RunStatus::folder(self.run.clone(), &self.runs).map_err(BadInput::of)
+        RunStatus::folder(self.run.clone(), &self.runs)
     }
 
     /// Session of a viewer.

@@ -5,16 +5,13 @@ use std::net::SocketAddr;
 use std::time::Duration;
 
 use bus::shutdown::{self, Overdue, Stop};
-use bus::{
-    BusError, BusOptions, Endpoint, RouterProbe, free_address, open_unless, present, process_id,
-};
-use protocol::{Key, KeyExpr, Principal, ProcessId, Role, RunId};
+use bus::{BusError, BusOptions, Endpoint, RouterProbe, free_address, open_unless, process_id};
+use protocol::{Key, KeyExpr, Principal, Role, RunId};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use zenoh::{Session, Wait};
 
 use crate::operate::security::{self, RunKeys};
-use crate::operate::supervise::ProcessSpec;
 use crate::score::scorer_cav;
 
 /// Longest time for closing the session.
@@ -101,28 +98,6 @@ impl RouterEndpoint {
         probe
             .inspect_err(|error| tracing::warn!("the router is not watched: {error}"))
             .ok()
-    }
-
-    /// Processes to start, and a scorer, that are present already on a shared router.
-    ///
-    /// # Errors
-    /// [`BusError`] when the router does not answer.
-    pub fn present(
-        &self,
-        network: &Network,
-        run: &RunId,
-        specs: &[ProcessSpec],
-    ) -> Result<Vec<ProcessId>, BusError> {
-        // A router of its own is new, so nobody can be present on it.
-        if network.connect.is_none() {
-            return Ok(Vec::new());
-        }
-        let scorer = process_id(Role::Scorer, &scorer_cav());
-        let present = present(&self.session, KeyExpr::everyone_alive(run).as_str())?;
-        let ours = present.into_iter().filter(|process| {
-            *process == scorer || specs.iter().any(|spec| spec.name == process.as_str())
-        });
-        Ok(ours.collect())
     }
 
     /// Closes the session.

@@ -9,6 +9,7 @@ use protocol::NeighbourState;
 use serde::{Deserialize, Serialize};
 use support::atomic_file;
 use support::bounded_file::{self, MAX_TEXT_BYTES};
+use support::cli::BadInput;
 use support::file_error::{AtFile, FileError};
 use terminal::text_table::{Side, TextTable, number};
 
@@ -84,31 +85,12 @@ pub enum Phase {
     Suspended,
 }
 
-/// Reason why there is no status.
-#[derive(Debug, thiserror::Error)]
-pub enum StatusError {
-    /// The file cannot be read, or is no status.
-    #[error(transparent)]
-    File(#[from] FileError),
-    /// No run has this name or path.
-    #[error("there is no run {}, neither here nor in {}", name.display(), runs.display())]
-    NotThere {
-        /// Requested name or path.
-        name: PathBuf,
-        /// Folder of the run folders.
-        runs: PathBuf,
-    },
-    /// No run in the folder.
-    #[error("there is no run in {}", .0.display())]
-    NoRun(PathBuf),
-}
-
 impl RunStatus {
     /// Reads the status in the folder of a run, and checks whether its supervisor still runs.
     ///
     /// # Errors
-    /// [`StatusError`] names the file.
-    pub fn read(folder: &Path) -> Result<Self, StatusError> {
+    /// [`FileError`] when the file cannot be read, or is no status.
+    pub fn read(folder: &Path) -> Result<Self, FileError> {
         let path = folder.join(FILE);
         let text = bounded_file::read_text(&path, MAX_TEXT_BYTES).map_err(|error| {
             let hint = "is it the folder of a run that `v2vloc up` has started?";
@@ -129,15 +111,16 @@ impl RunStatus {
     /// Folder of a run that is named by its path or by its name in `runs`; not named: the newest.
     ///
     /// # Errors
-    /// [`StatusError::NotThere`], or [`StatusError::NoRun`] when none is named and there is none.
-    pub fn folder(named: Option<PathBuf>, runs: &Path) -> Result<PathBuf, StatusError> {
+    /// [`BadInput`] when no run has this name or path, or when none is named and there is none.
+    pub fn folder(named: Option<PathBuf>, runs: &Path) -> Result<PathBuf, BadInput> {
         match named {
             Some(run) if run.is_dir() => Ok(run),
             Some(name) if runs.join(&name).is_dir() => Ok(runs.join(name)),
-            Some(name) => Err(StatusError::NotThere {
-                name,
-                runs: runs.to_owned(),
-            }),
+            Some(name) => {
+                let (name, runs) = (name.display(), runs.display());
+                let problem = format!("there is no run {name}, neither here nor in {runs}");
+                Err(BadInput::new(problem))
+            }
             None => Self::newest(runs),
         }
     }
@@ -145,16 +128,16 @@ impl RunStatus {
     /// Folder of the run in `runs` with the newest status.
     ///
     /// # Errors
-    /// [`StatusError::NoRun`] when no run has one.
-    pub fn newest(runs: &Path) -> Result<PathBuf, StatusError> {
+    /// [`BadInput`] when no run has one.
+    pub fn newest(runs: &Path) -> Result<PathBuf, BadInput> {
         let entries = fs::read_dir(runs).into_iter().flatten().flatten();
         let folders = entries.filter_map(|entry| {
             let file = fs::metadata(entry.path().join(FILE)).ok()?;
             Some((file.modified().ok()?, entry.path()))
         });
         let newest = folders.max_by_key(|(written, _)| *written);
-        let (_, folder) = newest.ok_or_else(|| StatusError::NoRun(runs.to_owned()))?;
-        Ok(folder)
+        let problem = || BadInput::new(format!("there is no run in {}", runs.display()));
+        newest.map(|(_, folder)| folder).ok_or_else(problem)
     }
 
     /// Problems as text: of processes during the run; of failed or crashed ones when it is over.
@@ -395,10 +378,8 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let run = folder.path().join("test");
         fs::create_dir(&run).unwrap();
-        assert!(matches!(
-            RunStatus::newest(folder.path()),
-            Err(StatusError::NoRun(_))
-        ));
+        let error = RunStatus::newest(folder.path()).unwrap_err();
+        assert!(error.to_string().starts_with("there is no run in /"));
         assert!(
             RunStatus::read(&run)
                 .unwrap_err()
@@ -484,7 +465,7 @@ mod tests {
         stopped.kill().unwrap();
         stopped.wait().unwrap();
         fs::write(run.join(FILE), "{").unwrap();
-        assert!(matches!(RunStatus::read(&run), Err(StatusError::File(_))));
+        assert!(RunStatus::read(&run).is_err());
     }
 
     #[test]

@@ -346,7 +346,7 @@ mod tests {
                 area_m: [-50.0, -50.0, 50.0, 50.0],
             },
         };
-        line.to_json()
+        serde_json::to_string(&line).unwrap()
     }
 
     fn result(tick: u64, pose: PoseEstimate, boxes: &[Box3d]) -> String {

@@ -94,7 +94,13 @@ pub fn run(
     let report = std::thread::scope(|scope| {
         let reading = inputs.map(|inputs| scope.spawn(move || inputs.run()));
         let node = RunFollower::new(scope, (bus, session, options), frames.clone());
-        let followed = node.and_then(|node| node.follow(&subscriber, &members));
+        let followed = node.and_then(|mut node| {
+            let ended = node.publish_all(&subscriber, &members);
+            // Also after an error, as the scope waits for every thread that it has started.
+            node.sweeps.into_values().for_each(Forwarding::end);
+            node.report.left_out += subscriber.overwritten() + subscriber.undelivered();
+            ended.map(|()| node.report)
+        });
         // After an error the threads of the LiDARs have to end too.
         stop.request();
         let read = reading.map(|reading| reading.join().unwrap_or_default());
@@ -176,18 +182,6 @@ impl<'scope, 'env> RunFollower<'scope, 'env> {
     }
 
     /// Publishes what the run publishes until `subscriber` is closed.
-    fn follow(
-        mut self,
-        subscriber: &PassiveSubscriber,
-        members: &BoundedQueue<(), LivelinessEvent>,
-    ) -> Result<NodeReport> {
-        let ended = self.publish_all(subscriber, members);
-        // Also after an error, as the scope waits for every thread that it has started.
-        self.sweeps.into_values().for_each(Forwarding::end);
-        self.report.left_out += subscriber.overwritten() + subscriber.undelivered();
-        ended.map(|()| self.report)
-    }
-
     fn publish_all(
         &mut self,
         subscriber: &PassiveSubscriber,

@@ -3,8 +3,8 @@
 use std::collections::BTreeSet;
 
 use bus::BusError;
+use ros2::RosTopic;
 use ros2::endpoint::NodeName;
-use ros2::{RosName, RosTopic};
 use zenoh::Wait;
 use zenoh::pubsub::Subscriber;
 use zenoh::sample::SampleKind;
@@ -50,7 +50,13 @@ pub(super) fn publishes_clock(session: &RosSession, mode: ClockMode) -> Result<b
     if mode == ClockMode::Off {
         return Ok(false);
     }
-    let others = publishers(session, &RosTopic::Clock.name(None))?;
+    let own = &session.node;
+    // Nodes that publish it, without this one.
+    let publishers = own.publishers_of(&RosTopic::Clock.name(None));
+    let others = bus::tokens(&session.zenoh, &publishers)?
+        .filter_map(|token| NodeName::of_token(&token))
+        .filter(|node| node.zid != own.zid);
+    let others: BTreeSet<String> = others.map(|node| node.to_string()).collect();
     let is_published = others.is_empty() || mode == ClockMode::On;
     if !others.is_empty() {
         let names = Vec::from_iter(others).join(", ");
@@ -61,13 +67,4 @@ pub(super) fn publishes_clock(session: &RosSession, mode: ClockMode) -> Result<b
         }
     }
     Ok(is_published)
-}
-
-/// Nodes that publish a topic, without this one.
-fn publishers(session: &RosSession, topic: &RosName) -> Result<BTreeSet<String>, BusError> {
-    let (own, selector) = (&session.node, session.node.publishers_of(topic));
-    let nodes = bus::tokens(&session.zenoh, &selector)?
-        .filter_map(|token| NodeName::of_token(&token))
-        .filter(|node| node.zid != own.zid);
-    Ok(nodes.map(|node| node.to_string()).collect())
 }

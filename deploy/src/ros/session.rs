@@ -66,7 +66,8 @@ impl RosSession {
         let name = topic.name(self.node.namespace.as_ref());
         let (ros_type, qos) = (topic.ros_type(), topic.qos());
         let key = self.node.key(&name, ros_type);
-        let token = self.endpoint_token(EndpointKind::Publisher, &name, ros_type, qos);
+        let (id, kind) = (self.next_endpoint(), EndpointKind::Publisher);
+        let token = self.node.endpoint_token(id, kind, &name, ros_type, qos);
         let declared = declare_token(&self.zenoh, &token)?;
         RosPublisher::declare(&self.zenoh, &key, qos, (gid(&token), declared))
     }
@@ -92,22 +93,16 @@ impl RosSession {
             Box::new(builder.wait().map_err(refused)?)
         };
         // The token shows the subscription to other nodes, so it follows once messages are received.
-        let token = self.endpoint_token(EndpointKind::Subscription, topic, ros_type, qos);
+        let (id, kind) = (self.next_endpoint(), EndpointKind::Subscription);
+        let token = self.node.endpoint_token(id, kind, topic, ros_type, qos);
         Ok(RosSubscription {
             _subscriber: subscriber,
             _token: declare_token(&self.zenoh, &token)?,
         })
     }
 
-    fn endpoint_token(
-        &self,
-        kind: EndpointKind,
-        topic: &RosName,
-        ros_type: RosType,
-        qos: Qos,
-    ) -> String {
-        let id = self.endpoints.fetch_add(1, Ordering::Relaxed) + 1;
-        self.node.endpoint_token(id, kind, topic, ros_type, qos)
+    fn next_endpoint(&self) -> u32 {
+        self.endpoints.fetch_add(1, Ordering::Relaxed) + 1
     }
 }
 

@@ -1,12 +1,11 @@
 //! Record of a scored frame.
 
 use protocol::{Box3d, CavId, Detections, Pose};
-use serde::Serialize;
 
 use super::StageStamps;
 
 /// One line of `frames.csv`: a tick of the scene, with or without a result of the ego.
-#[derive(Debug, Clone, PartialEq, Default, Serialize)]
+#[derive(Debug, Clone, PartialEq, Default)]
 pub struct FrameRecord {
     /// Tick of the scene, counted from 0.
     pub tick: u64,
@@ -46,7 +45,7 @@ pub struct FrameRecord {
 }
 
 /// The last result that had been published by a tick, scored against the truth at that tick.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub struct StreamedResult {
     /// Tick of the sweep that it was made from.
     pub tick: u64,

@@ -2,15 +2,16 @@
 
 use std::collections::BTreeMap;
 
-use dataset::average_precision::{Ordering, Scorer};
+use dataset::average_precision::{Breakdown, Ordering, Scorer};
 use dataset::ground_truth::{GroundTruth, GroundTruthRule};
 use protocol::{CavId, Detections, DropReason, Pose, PoseError, PoseEstimate, Stamp, Truth};
+use support::csv_file::CsvText;
 
 use super::frame_record::{FrameRecord, JudgedFrame};
-use super::live_precision::{EgoTick, LivePrecision, TickAnswer};
+use super::live_precision::{EgoTick, LivePrecision};
 use super::neighbours::{self, NeighbourRecord};
 use super::open_ticks::{OpenTick, OpenTicks};
-use super::precision::{FrameCounts, by_iou, by_part, precision_recall_csv};
+use super::precision::{FrameCounts, by_iou};
 use super::stage_stamps::StageStamps;
 use super::true_boxes::ground_truth;
 use super::truth_line::TruthLine;
@@ -137,21 +138,48 @@ impl FrameScores {
     }
 
     /// Average precision over the answered ticks, ordered by score over all frames, and ordered by frame.
-    pub fn average_precision(&self) -> (ByIou, ByIou) {
-        let [global, frame] =
-            [Ordering::Global, Ordering::Frame].map(|by| by_iou(self.scorer.tallies(), by));
-        (global, frame)
+    pub fn average_precision(&self) -> [ByIou; 2] {
+        [Ordering::Global, Ordering::Frame].map(|by| by_iou(self.scorer.tallies(), by))
     }
 
-    /// Average precision over the answered ticks by distance and by class, ordered by score over all frames.
+    /// Average precision over the answered ticks by distance and by class, of the parts that have objects, ordered by
+    /// score over all frames.
     pub fn average_precision_by_part(&self) -> [BTreeMap<String, PartPrecision>; 2] {
-        by_part(&self.scorer)
+        let mut by_part = [BTreeMap::new(), BTreeMap::new()];
+        let [distances, classes] = &mut by_part;
+        for (part, tallies) in self.scorer.parts() {
+            let objects = tallies.first().map_or(0, |tally| tally.objects);
+            if objects > 0 {
+                let precision = PartPrecision {
+                    objects,
+                    ap: by_iou(tallies, Ordering::Global),
+                };
+                match part {
+                    Breakdown::Distance(_) => distances.insert(part.to_string(), precision),
+                    Breakdown::Class(_) => classes.insert(part.to_string(), precision),
+                };
+            }
+        }
+        by_part
     }
 
     /// Precision over recall at the three IoU thresholds as a table, a row per detection by falling score; precision is
     /// made non-increasing in recall, as for [`Self::average_precision`].
     pub fn precision_recall_csv(&self) -> String {
-        precision_recall_csv(&self.scorer)
+        let mut text = CsvText::new("iou,score,recall,precision");
+        for tally in self.scorer.tallies() {
+            let curve = tally.curve(Ordering::Global);
+            let mut scores: Vec<f32> = tally.matched.iter().map(|matched| matched.score).collect();
+            scores.sort_by(|a, b| b.total_cmp(a));
+            // The curve has a point more at each end.
+            let points = curve.recall.iter().zip(&curve.precision).skip(1);
+            for (score, (recall, precision)) in scores.iter().zip(points) {
+                let numbers =
+                    [f64::from(*score), *recall, *precision].map(|number| format!("{number:.6}"));
+                text.row([tally.iou_threshold.to_string()].into_iter().chain(numbers));
+            }
+        }
+        text.finish()
     }
 
     /// From the first to the last frame on the scene's clock, seconds; scenarios that follow one another add up.
@@ -239,23 +267,21 @@ impl FrameScores {
             began_nanos,
             world_from_ego,
         };
-        let published = answer.as_ref().map(|(_, nanos, result)| TickAnswer {
-            published_nanos: *nanos,
-            detections: &result.detections,
-        });
+        let published_nanos = answer.as_ref().and_then(|(_, nanos, _)| *nanos);
+        let detections = answer.as_ref().map(|(.., result)| &result.detections[..]);
+        let live = &mut self.live;
         let mut record = FrameRecord {
             tick,
             capture_nanos,
             truth: objects.objects.len(),
-            streamed: self.live.add(ego_tick, objects, published),
+            streamed: live.add(ego_tick, objects, detections, published_nanos),
             ..FrameRecord::default()
         };
         let Some((stamps, _, result)) = answer else {
             record.stamps.began_nanos = Some(began_nanos);
             return self.records.push(record);
         };
-        let verdicts = self.scorer.add(&result.detections, objects);
-        let counts = FrameCounts::of(&self.scorer, &verdicts);
+        let counts = FrameCounts::of(&mut self.scorer, &result.detections, objects);
         let fused = result.fused.iter();
         let bytes = fused.clone().map(|of| (of.payload_bytes, of.wire_bytes));
         let ages_ms = fused.map(|of| of.age_nanos as f64 * 1e-6);
@@ -282,7 +308,12 @@ impl FrameScores {
         neighbours::add(&mut self.neighbours, &result);
         self.bytes.extend(bytes);
         self.ages_ms.extend(ages_ms);
-        self.keep_showpiece(tick, result, objects, world_from_lidar);
+        self.keep_showpiece(JudgedFrame {
+            tick,
+            result,
+            truth: objects.boxes().collect(),
+            world_from_lidar,
+        });
     }
 
     fn judge_poses(&mut self, poses: &[(CavId, PoseEstimate)], truth: &[(CavId, Pose)]) {
@@ -298,23 +329,12 @@ impl FrameScores {
         }
     }
 
-    fn keep_showpiece(
-        &mut self,
-        tick: u64,
-        result: Detections,
-        objects: &GroundTruth,
-        world_from_lidar: Vec<(CavId, Pose)>,
-    ) {
+    fn keep_showpiece(&mut self, frame: JudgedFrame) {
+        let rank = |frame: &JudgedFrame| (frame.result.fused.len(), frame.truth.len());
         let best = self.best.as_ref();
-        let best = best.map(|best| (best.result.fused.len(), best.truth.len()));
         // Strictly better, so of equal frames the first one stays.
-        if best.is_none_or(|best| (result.fused.len(), objects.objects.len()) > best) {
-            self.best = Some(JudgedFrame {
-                tick,
-                result,
-                truth: objects.boxes().collect(),
-                world_from_lidar,
-            });
+        if best.is_none_or(|best| rank(&frame) > rank(best)) {
+            self.best = Some(frame);
         }
     }
 }

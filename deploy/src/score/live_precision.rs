@@ -43,42 +43,34 @@ pub(super) struct EgoTick {
     pub(super) world_from_ego: Option<Pose>,
 }
 
-/// Detections of a tick.
-pub(super) struct TickAnswer<'a> {
-    /// Time of publication, nanoseconds; `None` without a clock.
-    pub(super) published_nanos: Option<u64>,
-    /// In the ego's LiDAR frame at the capture.
-    pub(super) detections: &'a [Detection],
-}
-
 impl LivePrecision {
-    /// Adds a tick, the objects in the ego's LiDAR frame at it, and its detections, if there are some; returns the
-    /// detections that were newest at that time, with their score.
+    /// Adds a tick, the objects in the ego's LiDAR frame at it, and its detections, if there are some, in that frame at
+    /// the capture, with their time of publication, nanoseconds, `None` without a clock; returns the detections that
+    /// were newest at that time, with their score.
     pub(super) fn add(
         &mut self,
         tick: EgoTick,
         truth: &GroundTruth,
-        answer: Option<TickAnswer<'_>>,
+        detections: Option<&[Detection]>,
+        published_nanos: Option<u64>,
     ) -> Option<StreamedResult> {
         self.ticks += 1;
-        self.answered += u64::from(answer.is_some());
-        let detections = answer.as_ref().map_or(&[][..], |answer| answer.detections);
-        self.all_ticks.add(detections, truth);
+        self.answered += u64::from(detections.is_some());
+        self.all_ticks.add(detections.unwrap_or_default(), truth);
         // Before the result of this tick is added: it is published after the tick.
         let known = self.newest(&tick);
         let moved = known.as_ref().map_or(&[][..], |(.., moved)| moved);
-        let verdicts = self.streaming.add(moved, truth);
-        let FrameCounts { detected, found } = FrameCounts::of(&self.streaming, &verdicts);
+        let FrameCounts { detected, found } = FrameCounts::of(&mut self.streaming, moved, truth);
         let streamed = known.map(|(tick, age_ms, _)| StreamedResult {
             tick,
             age_ms,
             detected,
             found,
         });
-        let Some(answer) = answer else {
+        let Some(detections) = detections else {
             return streamed;
         };
-        let Some(nanos) = answer.published_nanos else {
+        let Some(nanos) = published_nanos else {
             self.is_untimed = true;
             return streamed;
         };
@@ -89,7 +81,7 @@ impl LivePrecision {
         self.published.push_back(PublishedAnswer {
             nanos,
             tick,
-            detections: answer.detections.to_vec(),
+            detections: detections.to_vec(),
         });
         if self.published.len() > MOST_KEPT {
             self.published.pop_front();
@@ -180,16 +172,13 @@ mod tests {
                 source: None,
             }];
             let published_nanos = Some(began_nanos + latency_ms * 1_000_000);
-            let answer = answered.contains(&tick).then_some(TickAnswer {
-                published_nanos,
-                detections: &found,
-            });
+            let detections = answered.contains(&tick).then_some(&found[..]);
             let tick = EgoTick {
                 number: tick,
                 began_nanos,
                 world_from_ego,
             };
-            live.add(tick, &truth, answer)
+            live.add(tick, &truth, detections, published_nanos)
         });
         let streamed = streamed.collect();
         (live, streamed)
@@ -253,16 +242,13 @@ mod tests {
         for (tick, truth) in (0..).zip(&[truth_at(-48.0), truth_at(10.0)]) {
             let began_nanos = 1_000 * tick;
             let world_from_ego = Some(Pose::from_xyz_yaw([5.0 * tick as f64, 0.0, 0.0], 0.0));
-            let answer = (tick == 0).then_some(TickAnswer {
-                published_nanos: Some(began_nanos),
-                detections: &found,
-            });
+            let detections = (tick == 0).then_some(&found[..]);
             let tick = EgoTick {
                 number: tick,
                 began_nanos,
                 world_from_ego,
             };
-            live.add(tick, truth, answer);
+            live.add(tick, truth, detections, Some(began_nanos));
         }
         assert_eq!(
             live.streaming.tallies()[0].matched,
@@ -291,16 +277,13 @@ mod tests {
                 score: 0.9,
                 source: None,
             }];
-            let answer = TickAnswer {
-                published_nanos: Some(began_nanos + 50_000_000),
-                detections: &found,
-            };
+            let published_nanos = Some(began_nanos + 50_000_000);
             let tick = EgoTick {
                 number: tick,
                 began_nanos,
                 world_from_ego: (tick != 1).then(|| Pose::from_xyz_yaw([ego_x, 0.0, 0.0], 0.0)),
             };
-            let streamed = live.add(tick, truth, Some(answer));
+            let streamed = live.add(tick, truth, Some(&found), published_nanos);
             streamed.map(|streamed| (streamed.tick, streamed.found))
         });
         assert_eq!(streamed.collect::<Vec<_>>(), [None, None, Some((0, 1))]);
@@ -321,11 +304,7 @@ mod tests {
             began_nanos: 0,
             world_from_ego: None,
         };
-        let answer = TickAnswer {
-            published_nanos: None,
-            detections: &found,
-        };
-        live.add(tick, &truth, Some(answer));
+        live.add(tick, &truth, Some(&found), None);
         assert_eq!(
             (live.streaming(), live.unanswered_empty().at_70),
             (None, Some(1.0))

@@ -102,7 +102,7 @@ impl Metrics {
     ) -> Self {
         let records = scores.records().iter();
         let fused = records.clone().map(|record| record.fused).sum();
-        let (ap_global, ap_frame_order) = scores.average_precision();
+        let [ap_global, ap_frame_order] = scores.average_precision();
         let [ap_by_distance, ap_by_class] = scores.average_precision_by_part();
         let latencies_ms = records.filter_map(|record| record.latency_ms);
         let (ticks, answered) = scores.ticks();
@@ -270,26 +270,22 @@ impl Percentiles {
     }
 }
 
-impl From<Counts> for Messages {
-    fn from(counts: Counts) -> Self {
+impl Messages {
+    fn of(counts: Counts, unreceived: u64) -> Self {
         Self {
             sent: counts.sent,
             received: counts.received,
             in_flight: counts.in_flight,
             dropped: counts.dropped,
-            unreceived: 0,
+            unreceived,
         }
     }
-}
 
-impl Messages {
     /// Sums over the receivers of a run.
     pub fn of_run(ledger: &Ledger) -> Self {
         let unreceived = ledger.balance().unreceived;
-        Self {
-            unreceived: unreceived.iter().map(|topic| topic.messages).sum(),
-            ..ledger.delivered().into()
-        }
+        let unreceived = unreceived.iter().map(|topic| topic.messages);
+        Self::of(ledger.delivered(), unreceived.sum())
     }
 
     /// Sums of an evaluation, over the topics that `is_counted` selects: each message has one receiver, the ego of its
@@ -301,7 +297,7 @@ impl Messages {
                 total.add(counts);
             }
         }
-        total.into()
+        Self::of(total, 0)
     }
 
     /// True if most of the messages that were sent neither arrived nor were lost: then the link carries next to

@@ -356,7 +356,7 @@ impl ScorerWorker {
             self.recent.pop_first();
         }
         if let Some(line) = self.scores.truth_line(stamp, &truth) {
-            self.truth_lines.add(line.to_json());
+            self.truth_lines.add(&line);
         }
         self.scores.truth(stamp, truth);
         self.write_results(false);
@@ -404,11 +404,11 @@ impl ScorerWorker {
     /// Writes the results whose tick is known, or will not be.
     fn write_results(&mut self, is_over: bool) {
         while let Some(report) = numbered(&mut self.waiting, &self.recent, is_over) {
-            self.detections.add(report.to_json());
+            self.detections.add(&report);
         }
         if let Some(lines) = &mut self.tracks {
             while let Some(report) = numbered(&mut self.waiting_tracks, &self.recent, is_over) {
-                lines.add(report.to_json());
+                lines.add(&report);
             }
         }
     }

@@ -7,7 +7,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::{Arc, Mutex};
 
-use bus::{Bus, BusError, LivelinessEvent, LivelinessSubscription, process_id};
+use bus::{Bus, BusError, LivelinessEvent, Subscription, process_id};
 use protocol::{Account, Role, Topic};
 use support::sync::lock;
 
@@ -17,7 +17,7 @@ const ROLES: [Role; 4] = [Role::Agent, Role::Ego, Role::Link, Role::Replay];
 pub(crate) struct OfflineIntervals {
     /// Processes that have left, each with whether it has rejoined since.
     departed: Arc<Mutex<BTreeMap<String, bool>>>,
-    _watches: Vec<LivelinessSubscription>,
+    _watches: Vec<Subscription>,
 }
 
 impl OfflineIntervals {

@@ -50,8 +50,9 @@ impl<W: Write> ResultLines<W> {
     }
 
     /// Adds a line; another process may be reading the file.
-    pub(super) fn add(&mut self, json: String) {
-        let line = json + "\n";
+    pub(super) fn add(&mut self, value: &impl Serialize) {
+        // Numbers, names and lists have a spelling in JSON.
+        let line = serde_json::to_string(value).unwrap_or_default() + "\n";
         // All or nothing: a line that does not fit into the buffer is not begun.
         let has_room = self.out.buffer().len() + line.len() <= WAITING || self.out.flush().is_ok();
         match has_room.then(|| self.out.write_all(line.as_bytes())) {
@@ -148,9 +149,9 @@ mod tests {
         let disk = Disk::default();
         let mut lines = ResultLines::over("test.jsonl".into(), disk.clone());
         disk.make_room(report(0).to_json().len() + 7);
-        (0..5).for_each(|tick| lines.add(report(tick).to_json()));
+        (0..5).for_each(|tick| lines.add(&report(tick)));
         disk.make_room(1 << 30);
-        lines.add(report(5).to_json());
+        lines.add(&report(5));
         assert_eq!((lines.finish(), disk.lines().len()), (0, 6));
     }
 
@@ -159,10 +160,10 @@ mod tests {
         let disk = Disk::default();
         let mut lines = ResultLines::over("test.jsonl".into(), disk.clone());
         let fitting = WAITING / (report(10).to_json().len() + 1);
-        (0..fitting + 30).for_each(|tick| lines.add(report(10 + tick as u64 % 10).to_json()));
+        (0..fitting + 30).for_each(|tick| lines.add(&report(10 + tick as u64 % 10)));
         assert_eq!((lines.lost, lines.waiting as usize), (30, fitting));
         disk.make_room(1 << 30);
-        lines.add(report(99).to_json());
+        lines.add(&report(99));
         assert_eq!(lines.finish(), 30);
         let written = disk.lines();
         assert_eq!(
@@ -172,7 +173,7 @@ mod tests {
 
         let full = Disk::default();
         let mut lines = ResultLines::over("test.jsonl".into(), full.clone());
-        (0..3).for_each(|tick| lines.add(report(tick).to_json()));
+        (0..3).for_each(|tick| lines.add(&report(tick)));
         assert_eq!((lines.finish(), full.lines().len()), (3, 0));
     }
 }

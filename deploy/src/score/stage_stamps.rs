@@ -3,10 +3,9 @@
 use protocol::StageTiming;
 
 /// Milliseconds after the publication of the tick; each is `None` if unknown.
-#[derive(Debug, Clone, Copy, PartialEq, Default, serde::Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct StageStamps {
     /// Time of publication of the tick, Unix nanoseconds: origin of all others.
-    #[serde(skip)]
     pub began_nanos: Option<u64>,
     /// Publication of the pose by the ego's agent; unknown, as the next, where the agent has another clock.
     pub posed_ms: Option<f64>,

@@ -21,11 +21,3 @@ pub struct TruthLine {
     #[serde(flatten)]
     pub truth: GroundTruth,
 }
-
-impl TruthLine {
-    /// The line, without its end.
-    pub fn to_json(&self) -> String {
-        // Numbers, names and lists have a spelling in JSON.
-        serde_json::to_string(self).unwrap_or_default()
-    }
-}

@@ -10,6 +10,7 @@ use protocol::{
     Boxes, CavId, Descriptor, Detection, Detections, Header, Ledger, Lidar, Limits, Payload, Pose,
     PoseEstimate, StageSummary, Stats, Stream, Topic, Tracks, TrueObject, Truth, wire,
 };
+use support::sampling::distinct;
 
 use super::judgement::{DetectionArea, Judge, Judgement};
 use super::pace_counter::PaceCounter;
@@ -367,12 +368,7 @@ impl OpenFrame {
         let ego = self.result().map(|result| &result.ego);
         let in_truth = self.true_agents().map(|agent| &agent.cav);
         let with_messages = self.poses.keys().chain(self.sweeps.keys());
-        let mut cavs: Vec<&CavId> = Vec::new();
-        for cav in ego.into_iter().chain(in_truth).chain(with_messages) {
-            if !cavs.contains(&cav) {
-                cavs.push(cav);
-            }
-        }
+        let cavs = distinct(ego.into_iter().chain(in_truth).chain(with_messages));
         let mut points = Vec::new();
         let vehicles = cavs.into_iter().map(|cav| self.vehicle(cav, &mut points));
         (vehicles.collect(), points)

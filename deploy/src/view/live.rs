@@ -48,13 +48,6 @@ const CHECK_PERIOD: Duration = Duration::from_millis(100);
 
 /// Format and content of an image.
 pub(super) type Image = (ImageFormat, Bytes);
-/// Newest image of each camera.
-type NewestImages = OnDemand<(CavId, u8), Image>;
-/// Newest feature map of each vehicle, as a message.
-type NewestMaps = OnDemand<CavId, Bytes>;
-/// Newest scene frame, after its length, of each ego that a page shows; of no name: the first with results. Empty: none
-/// so far.
-type NewestFrames = BTreeMap<Option<CavId>, watch::Sender<Bytes>>;
 
 /// Newest scene frame of a run, for any number of pages. The run is subscribed to only while a page is open, so that a
 /// closed page costs nothing. Points are those of previews, which are sent only while they have a subscriber.
@@ -66,12 +59,14 @@ pub struct LiveRun {
 
 /// State of a live run: the thread writes it, pages read it.
 pub(super) struct LiveState {
-    newest: Mutex<NewestFrames>,
+    /// Newest scene frame, after its length, of each ego that a page shows; of no name: the first with results. Empty:
+    /// none so far.
+    newest: Mutex<BTreeMap<Option<CavId>, watch::Sender<Bytes>>>,
     activity: Mutex<RunActivity>,
-    /// Newest images of the cameras.
-    pub(super) images: NewestImages,
-    /// Newest feature maps of the vehicles.
-    pub(super) maps: NewestMaps,
+    /// Newest image of each camera.
+    pub(super) images: OnDemand<(CavId, u8), Image>,
+    /// Newest feature map of each vehicle, as a message.
+    pub(super) maps: OnDemand<CavId, Bytes>,
     ending: AtomicBool,
 }
 

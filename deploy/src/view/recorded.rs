@@ -9,6 +9,7 @@ use protocol::{
 };
 use recording::{Entry, Recording, RecordingError, Result};
 use serde::Serialize;
+use support::sampling::distinct;
 
 use super::frame_assembler::{FrameAssembler, ReceivedMessage, decoded};
 use super::heat_map::HeatMap;
@@ -285,17 +286,13 @@ impl RecordedRun {
 
     /// All egos, in the order of their first results.
     fn egos_with_results(&self) -> Vec<CavId> {
-        let mut egos = Vec::new();
         let moments = self.moments.iter();
-        for entry in moments.flat_map(|moment| self.entries_of(moment)) {
-            if let Topic::Stream { cav, .. } = &entry.key.topic
-                && is_result(&entry.key.topic)
-                && !egos.contains(cav)
-            {
-                egos.push(cav.clone());
-            }
-        }
-        egos
+        let entries = moments.flat_map(|moment| self.entries_of(moment));
+        let egos = entries.filter_map(|entry| match &entry.key.topic {
+            topic @ Topic::Stream { cav, .. } if is_result(topic) => Some(cav),
+            _ => None,
+        });
+        distinct(egos).into_iter().cloned().collect()
     }
 
     /// `None` if there is neither truth nor result.

@@ -2,10 +2,9 @@
 
 use perception::detector::DetectorError;
 use perception::weights::FileError;
-use protocol::BevGrid;
 use tch::TchError;
 
-use fusion::method::{Exchange, Method, UnknownMethod};
+use fusion::method::UnknownMethod;
 use fusion::model::StageError;
 use fusion::warp::WarpError;
 
@@ -27,30 +26,12 @@ pub enum EgoError {
     /// Own maps cannot be aligned.
     #[error(transparent)]
     Warp(#[from] WarpError),
-    /// The ego's own view does not have the content that the method needs.
-    #[error("method {method} needs the ego's own {needed:?}, not {found:?}")]
-    OwnContent {
-        /// The method.
-        method: Method,
-        /// Content that it needs.
-        needed: Exchange,
-        /// Content found.
-        found: Exchange,
-    },
-    /// The ego's own map is of another network.
-    #[error(
-        "the ego's own map is {channels} x {found}, the network's is {expected_channels} x {expected}"
-    )]
-    OwnMap {
-        /// Channels found.
-        channels: u32,
-        /// BEV grid found.
-        found: BevGrid,
-        /// Channels of the network.
-        expected_channels: i64,
-        /// BEV grid of the network.
-        expected: BevGrid,
-    },
+    /// The ego's own view does not have the content that the method needs: the method, and both.
+    #[error("method {0}")]
+    OwnContent(String),
+    /// The ego's own map is of another network: channels and BEV grid found, and those of the network.
+    #[error("the ego's own map is {0}")]
+    OwnMap(String),
     /// The tensor library reported an error.
     #[error("fusion: {0}")]
     Torch(#[from] TchError),

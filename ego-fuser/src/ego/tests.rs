@@ -269,8 +269,8 @@ fn with_none_left_the_maps_of_every_method_are_ego_only() {
             .unwrap();
         assert_eq!(output.detections, ego_only, "{method}");
         let reasons = [
-            (0, Skipped::Unusable(DropReason::OutOfRange)),
-            (1, Skipped::Unusable(DropReason::NoPose)),
+            (0, Some(DropReason::OutOfRange)),
+            (1, Some(DropReason::NoPose)),
         ];
         assert_eq!(
             (output.fused, output.skipped),
@@ -399,7 +399,7 @@ fn an_ego_without_pose_continues_ego_only() {
         .detect(&lost, &[view("b", near(), Method::MAX, 0.1)])
         .unwrap();
     assert_eq!(output.detections, ego.detect(&own, &[]).unwrap().detections);
-    assert_eq!(output.skipped, [(0, Skipped::Unusable(DropReason::NoPose))]);
+    assert_eq!(output.skipped, [(0, Some(DropReason::NoPose))]);
 }
 
 #[test]
@@ -483,7 +483,7 @@ fn maps_of_another_network_are_left_out_and_named_where_they_are_the_egos_own() 
     map.features.channels = 3;
     let mut ego = Ego::new(detector(), Method::MAX).unwrap();
     let output = ego.detect(&own, std::slice::from_ref(&other)).unwrap();
-    assert_eq!(output.skipped, [(0, Skipped::Unusable(DropReason::Shape))]);
+    assert_eq!(output.skipped, [(0, Some(DropReason::Shape))]);
     assert!(
         ego.detect(&other, &[])
             .unwrap_err()
@@ -500,7 +500,7 @@ fn maps_of_another_network_are_left_out_and_named_where_they_are_the_egos_own() 
     ));
     assert_eq!(
         ego.detect(&own, &[boxes]).unwrap().skipped,
-        [(0, Skipped::Unusable(DropReason::Shape))]
+        [(0, Some(DropReason::Shape))]
     );
 }
 
@@ -556,7 +556,7 @@ fn codes_are_fused_as_the_maps_that_they_stand_for_and_no_others() {
     let skipped = ego.detect(&own, &mismatched).unwrap().skipped;
     assert_eq!(
         skipped,
-        [0, 1, 2].map(|index| (index, Skipped::Unusable(DropReason::Shape)))
+        [0, 1, 2].map(|index| (index, Some(DropReason::Shape)))
     );
 }
 
@@ -673,7 +673,7 @@ fn boxes_of_a_neighbour_count_where_the_weights_read_them_and_change_nothing_els
             assert_eq!(with.detections, without.detections, "{method}");
         }
         let refused = detect(false, &[&boxes]);
-        let shape = Skipped::Unusable(DropReason::Shape);
+        let shape = Some(DropReason::Shape);
         assert_eq!((refused.fused, refused.skipped), (vec![], vec![(0, shape)]));
         let read = detect(true, &[&boxes, &map]);
         assert_eq!(read.fused, [0, 1], "{method}");
@@ -700,7 +700,7 @@ fn boxes_of_a_neighbour_count_where_the_weights_read_them_and_change_nothing_els
             ..map.clone()
         };
         let newer = detect(true, &[&same, &late]);
-        let unneeded = Skipped::Unusable(DropReason::Unneeded);
+        let unneeded = Some(DropReason::Unneeded);
         assert_eq!((newer.fused, newer.skipped), (vec![0], vec![(1, unneeded)]));
         let mut foreign = map.clone();
         if let Content::Features(map) = &mut foreign.content {

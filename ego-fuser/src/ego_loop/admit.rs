@@ -274,7 +274,7 @@ impl EgoLoop {
     }
 
     pub(super) fn drop_message(&mut self, source: Source, reason: DropReason) {
-        self.outputs.push(Output::Dropped(source, reason));
+        self.outputs.push(Output::Counted(source, Some(reason)));
     }
 
     fn drop_messages(&mut self, source: &Source, count: usize, reason: DropReason) {

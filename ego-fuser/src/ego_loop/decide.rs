@@ -6,7 +6,7 @@ use protocol::message::{FusedNeighbour, NeighbourState, SkippedNeighbour, StageT
 use protocol::{Detections, DropReason, HEADER_LEN, Stream};
 
 use super::{EgoLoop, Output, OwnFrame, Source};
-use crate::ego::{Ego, Skipped, View};
+use crate::ego::{Ego, View};
 use crate::misbehaviour::Assessment;
 
 /// The neighbours' messages for a frame, and the neighbours without one.
@@ -94,7 +94,8 @@ impl EgoLoop {
                 self.report.refused_boxes += output.refused_boxes;
                 self.report.refused_velocities += output.refused_velocities;
                 let neighbours = self.states(&output.beliefs, &choice.views);
-                self.outputs.push(Output::Received(self.own_source()));
+                let own_source = self.own_source();
+                self.outputs.push(Output::Counted(own_source, None));
                 self.leave_out(&output.skipped, &output.fused, &mut choice);
                 let fused = self.mark_used(&own, &output.fused, &choice);
                 let transport = frame
@@ -237,14 +238,15 @@ impl EgoLoop {
     }
 
     /// Counts the views that are not in the result, and names those that should have been.
-    fn leave_out(&mut self, left_out: &[(usize, Skipped)], fused: &[usize], choice: &mut Choice) {
-        for &(index, why) in left_out {
+    fn leave_out(
+        &mut self,
+        left_out: &[(usize, Option<DropReason>)],
+        fused: &[usize],
+        choice: &mut Choice,
+    ) {
+        // Without a reason a view was evaluated, and rightly left out.
+        for &(index, reason) in left_out {
             let view = &choice.views[index];
-            let reason = match why {
-                Skipped::Unusable(reason) => Some(reason),
-                // It was evaluated, and rightly left out.
-                Skipped::NotNeeded => None,
-            };
             self.count(view, &choice.messages[index], reason);
             // A neighbour that is in the result by another message is not left out.
             if reason.is_some() && !fused.iter().any(|&one| choice.views[one].cav == view.cav) {
@@ -256,11 +258,9 @@ impl EgoLoop {
 
     /// Counts a message at its first use.
     fn count(&mut self, view: &View, message: &MessageInfo, reason: Option<DropReason>) {
-        let source = (view.cav.clone(), message.stream);
-        match reason {
-            _ if !message.is_first_use => {}
-            Some(reason) => self.drop_message(source, reason),
-            None => self.outputs.push(Output::Received(source)),
+        if message.is_first_use {
+            let source = (view.cav.clone(), message.stream);
+            self.outputs.push(Output::Counted(source, reason));
         }
     }
 }

@@ -29,16 +29,6 @@ pub enum Input<M = Box<Message>> {
     Wake,
 }
 
-impl Input {
-    /// The input if it is no message, whose form on the wire is not known any more.
-    pub(crate) fn without_message<M>(&self) -> Option<Input<M>> {
-        match self {
-            Self::Message(_) => None,
-            other => other.clone().try_map(|_| Err(())).ok(),
-        }
-    }
-}
-
 impl<M> Input<M> {
     /// The input with its message converted.
     pub(crate) fn try_map<N, E>(
@@ -107,10 +97,8 @@ pub enum Output {
         /// Cause.
         error: EgoError,
     },
-    /// Counts a message of a vehicle's stream as used.
-    Received(Source),
-    /// Counts a message of a vehicle's stream as not used.
-    Dropped(Source, DropReason),
+    /// Counts a message of a vehicle's stream as used, or as not used for a reason.
+    Counted(Source, Option<DropReason>),
     /// Publishes the share of sweeps that the fleet computes.
     Pace(Pace),
 }

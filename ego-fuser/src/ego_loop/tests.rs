@@ -78,11 +78,11 @@ impl Case {
     /// Streams of `b` whose messages were used, and those not used with the reason.
     fn accounts(outputs: &[Output]) -> (Vec<Stream>, Vec<(Stream, DropReason)>) {
         let used = outputs.iter().filter_map(|output| match output {
-            Output::Received((cav, stream)) if cav.as_str() == "b" => Some(*stream),
+            Output::Counted((cav, stream), None) if cav.as_str() == "b" => Some(*stream),
             _ => None,
         });
         let dropped = outputs.iter().filter_map(|output| match output {
-            Output::Dropped((cav, stream), reason) if cav.as_str() == "b" => {
+            Output::Counted((cav, stream), Some(reason)) if cav.as_str() == "b" => {
                 Some((*stream, *reason))
             }
             _ => None,

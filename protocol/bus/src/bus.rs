@@ -131,8 +131,8 @@ impl Bus {
                 tracing::warn!("{process} is live in run {run} already: waiting for its end");
             }
             if Instant::now() > until || stop.wait_until(Instant::now() + NAME_PERIOD) {
-                let (run, process) = (run.clone(), process.clone());
-                return Err(BusError::NameTaken { run, process });
+                let problem = format!("{process} is live in run {run}");
+                return Err(BusError::NameTaken(problem));
             }
         }
         Ok(())

@@ -1,5 +1,6 @@
 //! Credentials: keys and certificates that authenticate a process to its peers.
 
+use std::fmt::Display;
 use std::fs;
 use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
@@ -92,9 +93,8 @@ impl Credentials {
     }
 }
 
-fn bad(path: &Path, what: &impl ToString) -> BusError {
-    let (path, what) = (path.to_path_buf(), what.to_string());
-    BusError::Keys { path, what }
+fn bad(path: &Path, what: &impl Display) -> BusError {
+    BusError::Keys(format!("{}: {what}", path.display()))
 }
 
 fn readable(path: &Path) -> Result<String, BusError> {

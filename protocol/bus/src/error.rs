@@ -1,10 +1,8 @@
 //! Errors of the bus, each with its remedy.
 
+use std::fmt::Display;
 use std::io::ErrorKind;
-use std::path::PathBuf;
 
-use protocol::{ProcessId, RunId};
-use serde_json::Value;
 use support::cli::Interrupted;
 
 use super::endpoint::Endpoint;
@@ -20,27 +18,15 @@ pub enum BusError {
         "{0:?} is not an endpoint: tcp/HOST:PORT, for example tcp/127.0.0.1:7447, or quic/HOST:PORT with keys"
     )]
     Endpoint(String),
-    /// Keys that are missing or invalid.
-    #[error("{}: {what}", path.display())]
-    Keys {
-        /// The file or folder.
-        path: PathBuf,
-        /// Description of the error.
-        what: String,
-    },
+    /// Keys that are missing or invalid: the file or folder, and a description of the error.
+    #[error("{0}")]
+    Keys(String),
     /// An endpoint that requires keys.
     #[error("{0} requires keys: give their folder (--keys DIR; v2vloc keys creates them)")]
     NoKeys(Endpoint),
-    /// zenoh refused or changed a setting.
-    #[error("zenoh setting {key}: wanted {wanted}, {found}")]
-    Setting {
-        /// The key of the configuration.
-        key: &'static str,
-        /// The value requested.
-        wanted: Value,
-        /// The value that zenoh has set.
-        found: String,
-    },
+    /// zenoh refused or changed a setting: its key, the value requested and the one that zenoh has set.
+    #[error("zenoh setting {0}")]
+    Setting(String),
     /// Another process uses the port of the router's endpoint.
     #[error(
         "cannot listen at {0}: the port is in use; end the other process or choose another port"
@@ -65,32 +51,16 @@ pub enum BusError {
         /// Gives the process the exit code of an end on request.
         source: Interrupted,
     },
-    /// Another process has the name; receivers would reject the messages of both.
-    #[error("{process} is live in run {run} already; end it first, or choose another name")]
-    NameTaken {
-        /// The run.
-        run: RunId,
-        /// Name of both processes.
-        process: ProcessId,
-    },
-    /// The system cannot start a thread.
-    #[error("no thread for {what}: {cause}")]
-    Thread {
-        /// Purpose of the thread.
-        what: String,
-        /// Error of the system.
-        cause: std::io::Error,
-    },
-    /// The system has too little shared memory.
-    #[error(
-        "{wanted_mib} MiB of shared memory: {free_mib} MiB are free in /dev/shm; every process has a pool of its own"
-    )]
-    SharedMemory {
-        /// Size of the pool, or of the pools of several processes, MiB.
-        wanted_mib: usize,
-        /// Free memory, MiB.
-        free_mib: u64,
-    },
+    /// Another process has the name, in this run; receivers would reject the messages of both.
+    #[error("{0} already; end it first, or choose another name")]
+    NameTaken(String),
+    /// The system cannot start a thread: its purpose and the error of the system.
+    #[error("no thread for {0}")]
+    Thread(String),
+    /// The system has too little shared memory: the size of the pool, or of the pools of several processes, and the free
+    /// memory.
+    #[error("{0} are free in /dev/shm; every process has a pool of its own")]
+    SharedMemory(String),
     /// The metrics cannot be served at the address.
     #[error("cannot serve metrics at {address}: {cause}")]
     Metrics {
@@ -99,14 +69,9 @@ pub enum BusError {
         /// Error of the system.
         cause: std::io::Error,
     },
-    /// Any other error of zenoh.
-    #[error("zenoh, {doing}: {cause}")]
-    Zenoh {
-        /// Operation that failed.
-        doing: String,
-        /// Error text of zenoh.
-        cause: String,
-    },
+    /// Any other error of zenoh: the operation that failed and the error text of zenoh.
+    #[error("zenoh, {0}")]
+    Zenoh(String),
 }
 
 impl BusError {
@@ -135,14 +100,12 @@ impl BusError {
     }
 
     /// The error of a thread that cannot be spawned.
-    pub fn thread(what: impl Into<String>) -> impl FnOnce(std::io::Error) -> Self {
-        let what = what.into();
-        move |cause| Self::Thread { what, cause }
+    pub fn thread(what: impl Display) -> impl FnOnce(std::io::Error) -> Self {
+        move |cause| Self::Thread(format!("{what}: {cause}"))
     }
 
     /// An error of zenoh during an operation.
-    pub fn zenoh(doing: impl Into<String>, cause: &zenoh::Error) -> Self {
-        let (doing, cause) = (doing.into(), cause.to_string());
-        Self::Zenoh { doing, cause }
+    pub fn zenoh(doing: impl Display, cause: &zenoh::Error) -> Self {
+        Self::Zenoh(format!("{doing}: {cause}"))
     }
 }

@@ -7,7 +7,7 @@ use protocol::{CavId, Key, KeyExpr, ProcessId, Role, Topic};
 use zenoh::sample::SampleKind;
 use zenoh::{Session, Wait};
 
-use super::{Bus, BusError, process_id};
+use super::{Bus, BusError, Subscription, process_id};
 use crate::Result;
 
 /// Timeout of a liveliness query to the router.
@@ -80,12 +80,6 @@ pub enum LivelinessEvent {
     },
 }
 
-/// A subscription to tokens; ends when dropped.
-#[must_use = "the subscription ends when this is dropped"]
-pub struct LivelinessSubscription(
-    #[expect(dead_code, reason = "held for its lifetime only")] zenoh::pubsub::Subscriber<()>,
-);
-
 impl Bus {
     /// Declares the liveliness token of this process in its role.
     ///
@@ -110,7 +104,7 @@ impl Bus {
         &self,
         role: Role,
         report: impl Fn(LivelinessEvent) + Send + Sync + 'static,
-    ) -> Result<LivelinessSubscription> {
+    ) -> Result<Subscription> {
         let tokens = KeyExpr::alive(&self.identity().run, role);
         let liveliness = self.session().liveliness();
         let subscriber = liveliness
@@ -126,7 +120,7 @@ impl Bus {
             });
         subscriber
             .wait()
-            .map(LivelinessSubscription)
+            .map(|_held| Subscription { _held })
             .map_err(|cause| BusError::zenoh(format!("watching {tokens}"), &cause))
     }
 }

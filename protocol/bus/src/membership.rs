@@ -6,13 +6,13 @@ use std::time::Instant;
 use protocol::{CavId, Role};
 
 use super::bounded_queue::{BoundedQueue, Pop, PushOutcome};
-use super::liveliness::{LivelinessEvent, LivelinessSubscription};
-use super::{Bus, BusError};
+use super::liveliness::LivelinessEvent;
+use super::{Bus, BusError, Subscription};
 
 /// Liveliness events that wait to be polled; only the last of each vehicle is kept.
 pub struct Membership {
     events: Arc<BoundedQueue<CavId, bool>>,
-    _watch: LivelinessSubscription,
+    _watch: Subscription,
 }
 
 impl Membership {

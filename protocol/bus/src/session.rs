@@ -307,23 +307,22 @@ fn config(options: &BusOptions) -> Result<Config, BusError> {
     let mut config = Config::default();
     for (key, wanted) in options.settings() {
         let inserted = config.insert_json5(key, &wanted.to_string());
-        inserted.map_err(|cause| refused(key, &wanted, format!("rejected: {cause}")))?;
+        inserted.map_err(|cause| refused(key, &wanted, &format!("rejected: {cause}")))?;
     }
     // zenoh accepts some keys and ignores them: the values are read back.
     for (key, wanted) in options.settings() {
         let found = config
             .get_json(key)
-            .map_err(|cause| refused(key, &wanted, format!("cannot be read back: {cause}")))?;
+            .map_err(|cause| refused(key, &wanted, &format!("cannot be read back: {cause}")))?;
         if !serde_json::from_str::<Value>(&found).is_ok_and(|found| same(&found, &wanted)) {
-            return Err(refused(key, &wanted, format!("reads back as {found}")));
+            return Err(refused(key, &wanted, &format!("reads back as {found}")));
         }
     }
     Ok(config)
 }
 
-fn refused(key: &'static str, wanted: &Value, found: String) -> BusError {
-    let wanted = wanted.clone();
-    BusError::Setting { key, wanted, found }
+fn refused(key: &str, wanted: &Value, found: &str) -> BusError {
+    BusError::Setting(format!("{key}: wanted {wanted}, {found}"))
 }
 
 /// Equality that treats `1` and `1.0` as the same, and compares only the keys that were set.

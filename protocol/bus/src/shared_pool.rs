@@ -109,10 +109,9 @@ pub fn check_room(bytes: usize) -> Result<()> {
     if u64::try_from(bytes).is_ok_and(|bytes| bytes <= free) {
         return Ok(());
     }
-    Err(BusError::SharedMemory {
-        wanted_mib: bytes >> 20,
-        free_mib: free >> 20,
-    })
+    let (wanted, free) = (bytes >> 20, free >> 20);
+    let problem = format!("{wanted} MiB of shared memory: {free} MiB");
+    Err(BusError::SharedMemory(problem))
 }
 
 #[cfg(test)]

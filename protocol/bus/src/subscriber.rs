@@ -184,9 +184,9 @@ impl Inbox {
 
 /// A subscription; ends when dropped.
 #[must_use = "the subscription ends when this is dropped"]
-pub struct Subscription(
-    #[expect(dead_code, reason = "held for its lifetime only")] zenoh::pubsub::Subscriber<()>,
-);
+pub struct Subscription {
+    pub(super) _held: zenoh::pubsub::Subscriber<()>,
+}
 
 impl Subscription {
     pub(super) fn to_key(
@@ -229,7 +229,7 @@ impl Subscription {
                 filter.admit(topic, sample.payload(), sample.source_info());
             }
         });
-        declared.map(Self)
+        declared.map(|_held| Self { _held })
     }
 }
 

@@ -48,13 +48,13 @@ mod type_hash;
 pub use encode::{
     FrameInParent, Mount, MountError, body_in_lidar, clock, pose, static_transforms, transforms,
 };
-pub use motion::{MotionError, MotionType, TimedMotion};
+pub use motion::{MotionType, TimedMotion};
 pub use names::{FrameNames, NameError, RosName};
-pub use point_cloud::{PointCloudError, RosSweep, read_point_cloud};
+pub use point_cloud::{RosSweep, read_point_cloud};
 pub use qos::Qos;
 pub use read::ReadError;
 pub use ros_type::RosType;
-pub use stated_pose::{StatedPose, StatedPoseError};
+pub use stated_pose::StatedPose;
 pub use topic::{RosTopic, VehicleTopic};
 pub use transforms::{PoseType, Transform, read_header};
 pub use translator::{RosMessage, Translator};

@@ -32,32 +32,6 @@ pub struct TimedMotion {
     pub motion: EgoMotion,
 }
 
-/// Error of a message that no motion can be read from.
-#[derive(Debug, Clone, PartialEq, thiserror::Error)]
-pub enum MotionError {
-    /// The message is no CDR, ends early or has no time.
-    #[error(transparent)]
-    Message(#[from] ReadError),
-    /// A value is no number, or one that no vehicle reaches.
-    #[error("{field} is {found}, not from -{limit} to {limit}")]
-    Value {
-        /// Name of the field.
-        field: &'static str,
-        /// Its value.
-        found: f64,
-        /// Largest absolute value.
-        limit: f64,
-    },
-    /// The sensor states that it does not measure this.
-    #[error("{field} is {found}: nothing is measured")]
-    Unmeasured {
-        /// Name of the field.
-        field: &'static str,
-        /// Its value.
-        found: f64,
-    },
-}
-
 impl MotionType {
     /// The type of the message.
     pub fn ros_type(self) -> RosType {
@@ -71,8 +45,8 @@ impl MotionType {
     /// Reads a message in CDR, with its encapsulation header.
     ///
     /// # Errors
-    /// [`MotionError`] names the field and its value.
-    pub fn read(self, bytes: &[u8]) -> Result<TimedMotion, MotionError> {
+    /// [`ReadError`] names the field and its value.
+    pub fn read(self, bytes: &[u8]) -> Result<TimedMotion, ReadError> {
         let mut message = Reader::of(bytes)?;
         let (capture_nanos, _) = message.header()?;
         let motion = match self {
@@ -93,8 +67,7 @@ impl MotionType {
                 let [first, ..] = message.f64s::<9>("angular_velocity_covariance")?;
                 // REP-145: the first element is -1 where a sensor has no such measurement.
                 if first.to_bits() == (-1.0_f64).to_bits() {
-                    let (field, found) = ("angular_velocity_covariance[0]", first);
-                    return Err(MotionError::Unmeasured { field, found });
+                    return Err(unmeasured("angular_velocity_covariance[0]", first));
                 }
                 let most = EgoMotion::MAX_YAW_RATE_RAD_S;
                 EgoMotion {
@@ -114,7 +87,7 @@ impl MotionType {
 fn read_twist(
     message: &mut Reader<'_>,
     [speed_field, yaw_rate_field]: [&'static str; 2],
-) -> Result<EgoMotion, MotionError> {
+) -> Result<EgoMotion, ReadError> {
     let [speed_mps, _, _] = message.f64s(speed_field)?;
     let [_, _, z] = message.f64s(yaw_rate_field)?;
     let (max_speed, max_yaw_rate) = (EgoMotion::MAX_SPEED_MPS, EgoMotion::MAX_YAW_RATE_RAD_S);
@@ -125,7 +98,7 @@ fn read_twist(
 }
 
 /// The values of `motion` that are measured by their variances.
-fn measured(mut motion: EgoMotion, covariance: &[f64; 36]) -> Result<EgoMotion, MotionError> {
+fn measured(mut motion: EgoMotion, covariance: &[f64; 36]) -> Result<EgoMotion, ReadError> {
     // Row-major 6 x 6: x is the first variance, the rotation about z the last.
     // NaN is not below the bound.
     let [speed_variance, .., yaw_rate_variance] = covariance;
@@ -134,22 +107,22 @@ fn measured(mut motion: EgoMotion, covariance: &[f64; 36]) -> Result<EgoMotion, 
         .yaw_rate_rad_s
         .filter(|_| *yaw_rate_variance < UNMEASURED);
     if motion.speed_mps.is_none() && motion.yaw_rate_rad_s.is_none() {
-        let (field, found) = ("twist.covariance[0]", *speed_variance);
-        return Err(MotionError::Unmeasured { field, found });
+        return Err(unmeasured("twist.covariance[0]", *speed_variance));
     }
     Ok(motion)
 }
 
-fn within(field: &'static str, found: f64, limit: f64) -> Result<f64, MotionError> {
+fn within(field: &str, found: f64, limit: f64) -> Result<f64, ReadError> {
     // A value that is no number is within nothing.
     if found.abs() <= limit {
         return Ok(found);
     }
-    Err(MotionError::Value {
-        field,
-        found,
-        limit,
-    })
+    let problem = format!("{field} is {found}, not from -{limit} to {limit}");
+    Err(ReadError::Field(problem))
+}
+
+fn unmeasured(field: &str, found: f64) -> ReadError {
+    ReadError::Field(format!("{field} is {found}: nothing is measured"))
 }
 
 #[cfg(test)]
@@ -277,10 +250,7 @@ mod tests {
             let bytes = little(ty, Numbers::of(1.0, 0.5));
             let cut = ty.read(&bytes[..bytes.len() / 2]).unwrap_err().to_string();
             assert!(cut.contains(" at byte "), "{cut}");
-            assert!(matches!(
-                ty.read(&[9; 40]),
-                Err(MotionError::Message(ReadError::Encoding(_)))
-            ));
+            assert!(matches!(ty.read(&[9; 40]), Err(ReadError::Encoding(_))));
         }
     }
 

@@ -5,6 +5,7 @@
 //! in many (organised). Points without coordinates, as organised clouds
 //! have them for rays without a return, are left out.
 
+use protocol::text::excerpt;
 use protocol::{COLOUR_FIELDS, INTENSITY_FIELDS, IntensityKind, Limits, PointCloud};
 use re_cdr::{BigEndian, ByteOrder, LittleEndian};
 
@@ -30,63 +31,13 @@ pub struct RosSweep {
     pub too_far: usize,
 }
 
-/// Error of a message that is no point cloud, or one that cannot be read.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub enum PointCloudError {
-    /// The message is no CDR, ends early or has no time.
-    #[error(transparent)]
-    Message(#[from] ReadError),
-    /// A coordinate is missing.
-    #[error("no field {missing:?} among {found:?}")]
-    NoField {
-        /// The missing field.
-        missing: &'static str,
-        /// Names of the fields there are.
-        found: Vec<String>,
-    },
-    /// A field has another type than it can have.
-    #[error("field {name:?} has datatype {datatype} and count {count}, not {allowed}")]
-    FieldType {
-        /// Name of the field.
-        name: &'static str,
-        /// Its datatype, `sensor_msgs/PointField`.
-        datatype: u8,
-        /// Its number of values.
-        count: u32,
-        /// Datatypes that can be read.
-        allowed: &'static str,
-    },
-    /// A number of the layout contradicts another one.
-    #[error("{what} is {found}, not at least {needed} ({why})")]
-    Layout {
-        /// Name of the number.
-        what: &'static str,
-        /// Its value.
-        found: u64,
-        /// Least value that fits.
-        needed: u64,
-        /// What it has to hold.
-        why: &'static str,
-    },
-    /// More points or fields than are accepted.
-    #[error("{what}: {found}, at most {max} are accepted")]
-    TooMany {
-        /// What there is too much of.
-        what: &'static str,
-        /// Number in the message.
-        found: u64,
-        /// Largest number accepted.
-        max: u64,
-    },
-}
-
 /// Reads a `sensor_msgs/PointCloud2` in CDR, with its encapsulation header. No more memory is allocated than the message
 /// has bytes for. Of the limits those of points count, points without return included, and of the largest absolute
 /// coordinate and intensity.
 ///
 /// # Errors
-/// [`PointCloudError`] names the field and both values.
-pub fn read_point_cloud(bytes: &[u8], limits: &Limits) -> Result<RosSweep, PointCloudError> {
+/// [`ReadError`] names the field and both values.
+pub fn read_point_cloud(bytes: &[u8], limits: &Limits) -> Result<RosSweep, ReadError> {
     let mut message = Reader::of(bytes)?;
     let (capture_nanos, frame_id) = message.header()?;
     let (height, width) = (message.u32("height")?, message.u32("width")?);
@@ -199,7 +150,7 @@ struct PointColumns<'a> {
 }
 
 impl<'a> PointColumns<'a> {
-    fn find(fields: &[RosField<'a>]) -> Result<Self, PointCloudError> {
+    fn find(fields: &[RosField<'a>]) -> Result<Self, ReadError> {
         let [x, y, z] = ["x", "y", "z"].map(|name| coordinate(fields, name));
         let (xyz, intensity) = ([x?, y?, z?], intensity(fields)?);
         Ok(Self { xyz, intensity })
@@ -212,25 +163,22 @@ impl<'a> PointColumns<'a> {
     }
 }
 
-fn coordinate(fields: &[RosField<'_>], name: &'static str) -> Result<PointColumn, PointCloudError> {
+fn coordinate(fields: &[RosField<'_>], name: &'static str) -> Result<PointColumn, ReadError> {
     let allowed = "datatype 7 or 8 (FLOAT32, FLOAT64) and count 1";
     let found = column(fields, name, allowed, |datatype| {
         matches!(datatype, Datatype::Float32 | Datatype::Float64)
     })?;
-    found
-        .map(|(_, column)| column)
-        .ok_or_else(|| PointCloudError::NoField {
-            missing: name,
-            found: (fields.iter())
-                .map(|field| field.name.chars().take(40).collect())
-                .collect(),
-        })
+    found.map(|(_, column)| column).ok_or_else(|| {
+        let names = fields.iter().map(|field| excerpt(field.name, 40));
+        let found: Vec<String> = names.collect();
+        ReadError::Field(format!("no field {name:?} among {found:?}"))
+    })
 }
 
 /// The field of the most preferred name of an intensity, else of a packed colour.
 fn intensity<'a>(
     fields: &[RosField<'a>],
-) -> Result<Option<(&'a str, PointColumn, IntensityKind)>, PointCloudError> {
+) -> Result<Option<(&'a str, PointColumn, IntensityKind)>, ReadError> {
     for name in INTENSITY_FIELDS {
         if let Some((name, found)) = column(fields, name, "datatype 1 to 8 and count 1", |_| true)?
         {
@@ -260,7 +208,7 @@ fn column<'a>(
     name: &'static str,
     allowed: &'static str,
     is_allowed: impl Fn(Datatype) -> bool,
-) -> Result<Option<(&'a str, PointColumn)>, PointCloudError> {
+) -> Result<Option<(&'a str, PointColumn)>, ReadError> {
     let Some(field) = fields
         .iter()
         .find(|field| field.name.eq_ignore_ascii_case(name))
@@ -273,12 +221,10 @@ fn column<'a>(
             let offset = field.offset;
             Ok(Some((field.name, PointColumn { offset, datatype })))
         }
-        _ => Err(PointCloudError::FieldType {
-            name,
-            datatype: field.datatype,
-            count: field.count,
-            allowed,
-        }),
+        _ => Err(ReadError::Field(format!(
+            "field {name:?} has datatype {} and count {}, not {allowed}",
+            field.datatype, field.count
+        ))),
     }
 }
 
@@ -307,7 +253,7 @@ impl CloudLayout {
         columns: &PointColumns<'_>,
         data_len: usize,
         limits: &Limits,
-    ) -> Result<(), PointCloudError> {
+    ) -> Result<(), ReadError> {
         let points = u64::from(self.height) * u64::from(self.width);
         at_most("height x width", points, limits.max_points)?;
         let step = self.point_step.into();
@@ -323,31 +269,23 @@ impl CloudLayout {
     }
 }
 
-fn at_least(
-    what: &'static str,
-    found: u64,
-    needed: u64,
-    why: &'static str,
-) -> Result<(), PointCloudError> {
+fn at_least(what: &str, found: u64, needed: u64, why: &str) -> Result<(), ReadError> {
     if found >= needed {
         return Ok(());
     }
-    Err(PointCloudError::Layout {
-        what,
-        found,
-        needed,
-        why,
-    })
+    let problem = format!("{what} is {found}, not at least {needed} ({why})");
+    Err(ReadError::Field(problem))
 }
 
-fn at_most(what: &'static str, found: u64, max: u64) -> Result<(), PointCloudError> {
+fn at_most(what: &str, found: u64, max: u64) -> Result<(), ReadError> {
     if found <= max {
         return Ok(());
     }
-    Err(PointCloudError::TooMany { what, found, max })
+    let problem = format!("{what}: {found}, at most {max} are accepted");
+    Err(ReadError::Field(problem))
 }
 
-fn read_fields<'a>(message: &mut Reader<'a>) -> Result<Vec<RosField<'a>>, PointCloudError> {
+fn read_fields<'a>(message: &mut Reader<'a>) -> Result<Vec<RosField<'a>>, ReadError> {
     let count = message.u32("length of fields")?;
     at_most("fields", count.into(), MAX_FIELDS.into())?;
     let fields = (0..count).map(|_| {

@@ -9,26 +9,13 @@ pub enum ReadError {
     /// The encapsulation header, the first bytes of the message, names another encoding.
     #[error("encoding {0:?}, not 00 00 or 00 01 (CDR)")]
     Encoding(Vec<u8>),
-    /// The message ends early, or a text or flag in it is malformed.
-    #[error("{field} at byte {at} of {len}: {cause}")]
-    Cdr {
-        /// Field that is read.
-        field: &'static str,
-        /// Position, bytes after the encapsulation header.
-        at: usize,
-        /// Length of the message.
-        len: usize,
-        /// Error of the decoder.
-        cause: String,
-    },
-    /// The capture time is before 1970 or has more than 10^9 nanoseconds.
-    #[error("header.stamp is {sec} s and {nanosec} ns, not a time from 1970 on")]
-    Stamp {
-        /// Seconds.
-        sec: i32,
-        /// Nanoseconds.
-        nanosec: u32,
-    },
+    /// The message ends early, or a text or flag in it is malformed: the text names the field, its position in bytes after
+    /// the encapsulation header and the length of the message. Or a value is not one that the message may have (a capture
+    /// time before 1970 or with more than 10^9 nanoseconds, a layout of points that contradicts itself or holds too much, a
+    /// value that no vehicle reaches or that the sensor does not measure, a pose in another frame or none, a variance that
+    /// is none): the text names the field, its value and what is allowed.
+    #[error("{0}")]
+    Field(String),
 }
 
 /// Reader of one message after its encapsulation header, in the byte order that the header states.
@@ -69,12 +56,8 @@ impl<'a> Reader<'a> {
             AnyCdr::BigEndian(cdr) => (cdr.position(), if_big_endian(cdr)),
             AnyCdr::LittleEndian(cdr) => (cdr.position(), if_little_endian(cdr)),
         };
-        read.map_err(|cause| ReadError::Cdr {
-            field,
-            at,
-            len: self.len,
-            cause: cause.to_string(),
-        })
+        let len = self.len;
+        read.map_err(|cause| ReadError::Field(format!("{field} at byte {at} of {len}: {cause}")))
     }
 
     pub(crate) fn u8(&mut self, field: &'static str) -> Result<u8, ReadError> {
@@ -123,7 +106,9 @@ impl<'a> Reader<'a> {
         let sec = self.read(field, CdrReader::read_i32, CdrReader::read_i32)?;
         let nanosec = self.u32("header.stamp.nanosec")?;
         let seconds = u64::try_from(sec).ok().filter(|_| nanosec < 1_000_000_000);
-        let seconds = seconds.ok_or(ReadError::Stamp { sec, nanosec })?;
+        let problem =
+            || format!("header.stamp is {sec} s and {nanosec} ns, not a time from 1970 on");
+        let seconds = seconds.ok_or_else(|| ReadError::Field(problem()))?;
         let frame_id = self.str("header.frame_id")?;
         Ok((seconds * 1_000_000_000 + u64::from(nanosec), frame_id))
     }

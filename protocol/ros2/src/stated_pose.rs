@@ -1,6 +1,6 @@
 //! Stated pose: reader of the pose that a person draws in RViz or a program sends, with its covariance.
 
-use protocol::{InvalidPose, Pose};
+use protocol::Pose;
 
 use crate::names::MAP_FRAME;
 use crate::read::{ReadError, Reader};
@@ -19,41 +19,21 @@ pub struct StatedPose {
     pub yaw_std_rad: f64,
 }
 
-/// Error of a message that is no pose in the map.
-#[derive(Debug, Clone, PartialEq, thiserror::Error)]
-pub enum StatedPoseError {
-    /// The message is no CDR, or ends early.
-    #[error(transparent)]
-    Message(#[from] ReadError),
-    /// The pose is in another frame.
-    #[error("header.frame_id is {0:?}, not {MAP_FRAME:?}")]
-    Frame(String),
-    /// The numbers are no pose.
-    #[error("pose: {0}")]
-    Pose(#[from] InvalidPose),
-    /// A variance is no number.
-    #[error("covariance[{index}] is {found}, not a variance")]
-    Variance {
-        /// Its place.
-        index: usize,
-        /// Its value.
-        found: f64,
-    },
-}
-
 impl StatedPose {
     /// Reads a message in CDR, with its encapsulation header.
     ///
     /// # Errors
-    /// [`StatedPoseError`] names the field and its value.
-    pub fn read(bytes: &[u8]) -> Result<Self, StatedPoseError> {
+    /// [`ReadError`] names the field and its value.
+    pub fn read(bytes: &[u8]) -> Result<Self, ReadError> {
         let mut message = Reader::of(bytes)?;
         let (_, frame_id) = message.header()?;
         if frame_id.trim_start_matches('/') != MAP_FRAME {
-            return Err(StatedPoseError::Frame(frame_id.to_owned()));
+            let problem = format!("header.frame_id is {frame_id:?}, not {MAP_FRAME:?}");
+            return Err(ReadError::Field(problem));
         }
         let world_from_base = message.pose("pose")?;
-        world_from_base.validate()?;
+        let valid = world_from_base.validate();
+        valid.map_err(|error| ReadError::Field(format!("pose: {error}")))?;
         let covariance: [f64; 36] = message.f64s("covariance")?;
         // Row-major 6 x 6: variances of x, y and yaw are at 0, 7 and 35.
         let [xx, .., yaw] = covariance;
@@ -66,16 +46,14 @@ impl StatedPose {
     }
 }
 
-fn std(index: usize, variance: f64) -> Result<f64, StatedPoseError> {
+fn std(index: usize, variance: f64) -> Result<f64, ReadError> {
     let [least, most] = STD;
     if variance >= 0.0 {
         return Ok(variance.sqrt().clamp(least, most));
     }
     // NaN is no variance.
-    Err(StatedPoseError::Variance {
-        index,
-        found: variance,
-    })
+    let problem = format!("covariance[{index}] is {variance}, not a variance");
+    Err(ReadError::Field(problem))
 }
 
 #[cfg(test)]

@@ -7,11 +7,8 @@ use crate::WireError;
 /// # Errors
 /// [`WireError::Compression`] when zstd fails, for example for lack of memory.
 pub(super) fn pack(bytes: &[u8], level: i32) -> Result<Option<Vec<u8>>, WireError> {
-    let packed = zstd::bulk::compress(bytes, level).map_err(|error| WireError::Compression {
-        bytes: 0,
-        expected: bytes.len() as u64,
-        detail: error.to_string(),
-    })?;
+    let packed = zstd::bulk::compress(bytes, level);
+    let packed = packed.map_err(|error| failed(0, bytes.len(), &error.to_string()))?;
     Ok(Some(packed).filter(|packed| packed.len() < bytes.len()))
 }
 
@@ -23,11 +20,11 @@ pub(super) fn pack(bytes: &[u8], level: i32) -> Result<Option<Vec<u8>>, WireErro
 /// # Errors
 /// [`WireError::Compression`] when the frame is corrupt, or decompresses to more or fewer bytes.
 pub(super) fn unpack(packed: Vec<u8>, expected: usize) -> Result<Vec<u8>, WireError> {
-    decompress(&packed, expected).map_err(|detail| WireError::Compression {
-        bytes: packed.len() as u64,
-        expected: expected as u64,
-        detail,
-    })
+    decompress(&packed, expected).map_err(|detail| failed(packed.len(), expected, &detail))
+}
+
+fn failed(bytes: usize, expected: usize, detail: &str) -> WireError {
+    WireError::Compression(format!("{bytes} bytes, {expected} unpacked: {detail}"))
 }
 
 fn decompress(packed: &[u8], expected: usize) -> Result<Vec<u8>, String> {

@@ -272,8 +272,8 @@ impl EncodedFeatures {
     /// [`WireError::Grid`] and [`WireError::Shape`] state both.
     pub fn check_shape(&self, grid: &BevGrid, channels: u32, code_of: Option<u32>) -> Result<()> {
         if self.grid != *grid {
-            let (expected, found) = (grid.to_string(), self.grid.to_string());
-            return Err(WireError::Grid { expected, found });
+            let both = format!("{}, expected {grid}", self.grid);
+            return Err(WireError::Grid(both));
         }
         check_size("channels", self.channels.into(), channels.into())?;
         if self.code_of != code_of {

@@ -1,4 +1,4 @@
-//! Sampling: a part of a list, evenly spread over it.
+//! Sampling: a part of a list, evenly spread over it, or each item once.
 
 /// At most `count` of the items, evenly spread, the first of them included.
 pub fn evenly_spread<T: Clone>(items: &[T], count: usize) -> Vec<T> {
@@ -8,9 +8,25 @@ pub fn evenly_spread<T: Clone>(items: &[T], count: usize) -> Vec<T> {
         .collect()
 }
 
+/// The items in their order, of equal ones the first.
+pub fn distinct<T: PartialEq>(items: impl IntoIterator<Item = T>) -> Vec<T> {
+    let mut kept = Vec::new();
+    for item in items {
+        if !kept.contains(&item) {
+            kept.push(item);
+        }
+    }
+    kept
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn distinct_items_stay_in_their_order() {
+        assert_eq!(distinct([3, 1, 3, 2, 1]), [3, 1, 2]);
+    }
 
     #[test]
     fn the_chosen_items_are_spread_over_the_list() {

@@ -13,6 +13,7 @@ use super::points::{SweepStorage, Sweeps};
 use super::problem::listed;
 use super::yaml::{self, Value, YamlField};
 use super::{MissingFrame, OpenOptions, ReadError, Result, Tick, files};
+use crate::error::shown;
 use support::rounding;
 
 /// Depth below the opened folder to which scenarios are searched.
@@ -196,11 +197,9 @@ impl ScenarioFolder {
 
     /// The plain sweep of a frame, or a variant of it.
     pub(super) fn pcd(&self, agent: &CavId, stem: &str, variant: Option<&str>) -> PathBuf {
-        let name = match variant {
-            Some(variant) => format!("{stem}_{variant}{}", self.suffix),
-            None => format!("{stem}{}", self.suffix),
-        };
-        self.agent_dir(agent).join(name)
+        let variant = shown("_", variant, "");
+        self.agent_dir(agent)
+            .join(format!("{stem}{variant}{}", self.suffix))
     }
 
     /// The reader of all agents' sweeps.

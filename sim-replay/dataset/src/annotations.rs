@@ -160,7 +160,7 @@ impl<'a> Annotations<'a> {
         class.unwrap_or_else(|| {
             // The scenario's folder: the same finding in several agents' frames is one then.
             let scenario = self.root.path.ancestors().nth(2).unwrap_or(Path::new(""));
-            let problem = classes::unknown(scenario, key, &kind.found());
+            let problem = classes::unknown(scenario, key, &kind.node.value.kind());
             if !self.problems.contains(&problem) {
                 self.problems.push(problem);
             }

@@ -34,7 +34,6 @@ mod breakdown;
 mod frame_overlaps;
 
 use protocol::Detection;
-use protocol::rotated_iou::Polygon;
 
 use crate::ground_truth::GroundTruth;
 use breakdown::PartMembers;
@@ -193,20 +192,14 @@ impl Scorer {
                 tally.add(&frame, &part);
             });
         }
-        let all = PartMembers::all(detections.len(), truth.objects.len());
+        let all = PartMembers {
+            objects: vec![true; truth.objects.len()],
+            detections: vec![true; detections.len()],
+        };
         self.tallies
             .iter_mut()
             .map(|tally| tally.add(&frame, &all))
             .collect()
-    }
-
-    /// Adds a frame given as footprints, which all count; to the tallies of all objects only.
-    pub fn add_footprints(&mut self, detections: &[(Polygon, f32)], objects: &[Polygon]) {
-        let frame = FrameOverlaps::of_footprints(detections, objects);
-        let all = PartMembers::all(detections.len(), objects.len());
-        self.tallies.iter_mut().for_each(|tally| {
-            tally.add(&frame, &all);
-        });
     }
 
     /// The tallies of all objects, one per threshold.

@@ -124,14 +124,9 @@ pub fn mirrored_point([x, y, z]: [f64; 3]) -> [f64; 3] {
 
 /// `S R S` with `S = diag(1, -1, 1)`: the entries with exactly one index on y change sign.
 fn mirrored_rotation(rotation: &Matrix3<f64>) -> Matrix3<f64> {
-    Matrix3::from_fn(|row, column| {
-        let entry = rotation[(row, column)];
-        if (row == 1) == (column == 1) {
-            entry
-        } else {
-            -entry
-        }
-    })
+    rotation.component_mul(&Matrix3::new(
+        1.0, -1.0, 1.0, -1.0, 1.0, -1.0, 1.0, -1.0, 1.0,
+    ))
 }
 
 #[cfg(test)]

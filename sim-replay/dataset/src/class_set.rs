@@ -27,17 +27,6 @@ impl ClassSet {
         self.0 & bit(class) != 0
     }
 
-    /// Their names; `vehicle` if all four kinds of vehicles are in the set.
-    pub fn names(self) -> Vec<String> {
-        let has_vehicles = self.0 & Self::VEHICLES.0 == Self::VEHICLES.0;
-        let others = ObjectClass::ALL.iter().filter(|class| {
-            self.contains(**class) && !(has_vehicles && Self::VEHICLES.contains(**class))
-        });
-        let vehicle = has_vehicles.then_some(VEHICLE).into_iter();
-        let names = vehicle.chain(others.map(|class| class.name()));
-        names.map(str::to_owned).collect()
-    }
-
     fn of<'a>(names: impl IntoIterator<Item = &'a str>) -> Result<Self, String> {
         let mut set = Self(0);
         for asked in names.into_iter().map(str::trim) {
@@ -76,14 +65,22 @@ impl TryFrom<Vec<String>> for ClassSet {
 }
 
 impl From<ClassSet> for Vec<String> {
+    /// The names of the classes; `vehicle` if all four kinds of vehicles are in the set.
     fn from(set: ClassSet) -> Self {
-        set.names()
+        let vehicles = ClassSet::VEHICLES;
+        let has_vehicles = set.0 & vehicles.0 == vehicles.0;
+        let others = ObjectClass::ALL
+            .iter()
+            .filter(|class| set.contains(**class) && !(has_vehicles && vehicles.contains(**class)));
+        let vehicle = has_vehicles.then_some(VEHICLE).into_iter();
+        let names = vehicle.chain(others.map(|class| class.name()));
+        names.map(str::to_owned).collect()
     }
 }
 
 impl fmt::Display for ClassSet {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(&self.names().join(","))
+        f.write_str(&Vec::<String>::from(*self).join(","))
     }
 }
 

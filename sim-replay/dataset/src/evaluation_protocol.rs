@@ -67,7 +67,8 @@ pub enum EgoKind {
 /// Order of detections when precision and recall are summed up.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-#[derive(JsonSchema, clap::ValueEnum)]
+#[derive(JsonSchema, clap::ValueEnum, strum::IntoStaticStr)]
+#[strum(serialize_all = "snake_case")]
 pub enum ApOrder {
     /// By score over all frames.
     #[default]
@@ -84,10 +85,7 @@ impl ApOrder {
 
     /// Name in headings and in the columns of sweeps.
     pub fn name(self) -> &'static str {
-        match self {
-            Self::Global => "global",
-            Self::Frame => "frame",
-        }
+        self.into()
     }
 }
 

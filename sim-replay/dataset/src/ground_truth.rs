@@ -43,18 +43,11 @@ pub struct GroundTruth {
 }
 
 impl GroundTruth {
-    /// The ground truth of a tick for an ego, see [`merge`]. Without a true pose of the ego nothing tells where the true
+    /// The ground truth of a tick for an ego, see [`merged_objects`]. Without a true pose of the ego nothing tells where the true
     /// objects are: then no detection counts.
     pub fn of_tick(frames_of_tick: &[&Frame], ego_index: usize, rule: &GroundTruthRule) -> Self {
         let ego = frames_of_tick.get(ego_index);
-        if ego.is_none_or(|ego| ego.world_from_lidar.is_none()) {
-            return Self {
-                objects: Vec::new(),
-                ignored: Vec::new(),
-                // Nothing lies in this range.
-                area_m: [f64::MAX, f64::MAX, f64::MIN, f64::MIN],
-            };
-        }
+        let pose = ego.and_then(|ego| ego.world_from_lidar);
         let ([x_low, x_high], [y_low, y_high]) = (rule.x_m, rule.y_m);
         // Without the test of the range: an object at its border still excuses a detection.
         let ignored = select(
@@ -66,7 +59,11 @@ impl GroundTruth {
         Self {
             objects: true_boxes(&merged_objects(frames_of_tick, ego_index, rule)),
             ignored: true_boxes(&ignored),
-            area_m: [x_low, y_low, x_high, y_high],
+            area_m: match pose {
+                Some(_) => [x_low, y_low, x_high, y_high],
+                // Nothing lies in this range.
+                None => [f64::MAX, f64::MAX, f64::MIN, f64::MIN],
+            },
         }
     }
 
@@ -129,6 +126,7 @@ impl GroundTruthRule {
     /// True if enough corners lie in range, and all of them in x and y.
     pub fn keeps(&self, box3d: &Box3d) -> bool {
         let (mut inside, mut are_in_plane) = (0, true);
+        let is_within = |value: f64, [low, high]: [f64; 2]| (low..=high).contains(&value);
         for [x, y, z] in box3d.corners() {
             let is_in_plane = is_within(x, self.x_m) && is_within(y, self.y_m);
             inside += usize::from(is_in_plane && is_within(z, self.z_m));
@@ -157,27 +155,11 @@ pub(crate) const fn vehicles_in(
     }
 }
 
-fn is_within(value: f64, [low, high]: [f64; 2]) -> bool {
-    low <= value && value <= high
-}
-
-/// The objects of one tick in the frame of the ego's LiDAR, by id, in the order of first occurrence: the ego's own
-/// annotation first, then the other agents' in the order of `frames_of_tick`.
+/// The objects of one tick, by id, with their boxes in the frame of the ego's LiDAR, in the order of first occurrence:
+/// the ego's own annotation first, then the other agents' in the order of `frames_of_tick`.
 ///
 /// `frames_of_tick` are the frames of all agents at the tick, `ego_index` is the ego's index among them. Without a pose
 /// of the ego the result is empty.
-pub fn merge(
-    frames_of_tick: &[&Frame],
-    ego_index: usize,
-    rule: &GroundTruthRule,
-) -> Vec<(i64, Box3d)> {
-    merged_objects(frames_of_tick, ego_index, rule)
-        .into_iter()
-        .map(|(object, box3d)| (object.id, box3d))
-        .collect()
-}
-
-/// [`merge`] with the annotation that each box is of.
 pub fn merged_objects<'a>(
     frames_of_tick: &[&'a Frame],
     ego_index: usize,

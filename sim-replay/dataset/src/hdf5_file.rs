@@ -21,10 +21,8 @@ const ROOT: usize = 96;
 /// A message of an object header: type, and data padded to 8 bytes.
 fn message(kind: u16, mut data: Vec<u8>) -> Vec<u8> {
     data.resize(data.len().next_multiple_of(8), 0);
-    let mut message = [kind.to_le_bytes(), (data.len() as u16).to_le_bytes()].concat();
-    message.extend([0; 4]);
-    message.extend(data);
-    message
+    let len = (data.len() as u16).to_le_bytes();
+    [&kind.to_le_bytes()[..], &len, &[0; 4], &data].concat()
 }
 
 fn object_header(messages: &[Vec<u8>]) -> Vec<u8> {

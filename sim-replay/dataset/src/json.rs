@@ -131,11 +131,8 @@ impl<'a> JsonField<'a> {
 
     /// A time from 0, as a number or as text, in whatever unit: [`super::time_stamps`] tells it.
     pub(super) fn time(&self) -> Result<f64> {
-        let time = self.number()?;
-        if time < 0.0 {
-            return Err(self.expected("a time from 0"));
-        }
-        Ok(time)
+        let time = Some(self.number()?).filter(|time| *time >= 0.0);
+        time.ok_or_else(|| self.expected("a time from 0"))
     }
 
     /// A whole number from 0, as such or as text.

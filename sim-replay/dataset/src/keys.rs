@@ -193,7 +193,8 @@ impl<'a> Numbered<'a> {
         let end = stem.rfind(is_digit)? + 1;
         let (head, after) = stem.split_at_checked(end)?;
         let (before, number) = last_digits(head);
-        if let Some((whole, _)) = before.strip_suffix('.').map(last_digits).filter(has_digits) {
+        let fraction_of = before.strip_suffix('.').map(last_digits);
+        if let Some((whole, _)) = fraction_of.filter(|(_, digits)| !digits.is_empty()) {
             let number = head.strip_prefix(whole)?;
             return Some(Self {
                 around: (whole, after),
@@ -223,10 +224,6 @@ pub(super) fn stamp_nanos(seconds: &str, nanos: &str) -> Option<u64> {
 /// A text without the digits at its end, and these.
 fn last_digits(text: &str) -> (&str, &str) {
     text.split_at(text.trim_end_matches(is_digit).len())
-}
-
-fn has_digits((_, digits): &(&str, &str)) -> bool {
-    !digits.is_empty()
 }
 
 /// True for digits of seconds since 1970: nine or ten places without zeros in front.

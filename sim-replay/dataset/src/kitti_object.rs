@@ -12,7 +12,7 @@ use super::frame_files::{named_once, usual_stems};
 use super::kitti_text::{self, Calibration};
 use super::layout::{LayoutReader, LayoutRow};
 use super::points::{SweepStorage, Sweeps};
-use super::poses::box_angle_rad;
+use super::poses::{self, box_angle_rad};
 use super::{
     FrameSource, Layout, OpenOptions, Problem, ReadError, Result, Scenario, Tick, classes, files,
     repeats, single_vehicle,
@@ -166,9 +166,8 @@ fn object(
     }
     let class = classes::of_name(kind).unwrap_or(ObjectClass::Other);
     let camera_from_object = camera_from_object([x, y, z], height, rotation_y);
-    let world_from_object: Pose = (lidar_from_camera * camera_from_object).into();
-    let valid = world_from_object.validate();
-    valid.map_err(|error| fault(error.to_string()))?;
+    let world_from_object = poses::valid(lidar_from_camera * camera_from_object);
+    let world_from_object = world_from_object.map_err(|error| fault(error.to_string()))?;
     Ok(Object::new(id, class, world_from_object, size_m))
 }
 

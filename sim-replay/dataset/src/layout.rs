@@ -77,19 +77,18 @@ pub(super) fn opened(
     scenarios: Vec<Scenario>,
     mut problems: Vec<ReadError>,
 ) -> Result<Option<Dataset>> {
-    match scenarios.first().map(|scenario| scenario.layout) {
-        Some(layout) => Ok(Some(Dataset {
+    let layout = scenarios.first().map(|scenario| scenario.layout);
+    match (layout, problems.len()) {
+        (Some(layout), _) => Ok(Some(Dataset {
             layout,
             scenarios,
             problems,
         })),
-        None => match problems.len() {
-            0 => Ok(None),
-            1 => Err(problems.swap_remove(0)),
-            _ => {
-                let reason = format!("nothing can be opened: {}", listed(&problems));
-                Err(ReadError::malformed(dir, reason))
-            }
-        },
+        (None, 0) => Ok(None),
+        (None, 1) => Err(problems.swap_remove(0)),
+        (None, _) => {
+            let reason = format!("nothing can be opened: {}", listed(&problems));
+            Err(ReadError::malformed(dir, reason))
+        }
     }
 }

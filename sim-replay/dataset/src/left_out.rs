@@ -42,7 +42,7 @@ impl LeftOut {
     pub fn add_files<'a>(&mut self, problems: impl IntoIterator<Item = &'a super::ReadError>) {
         for problem in problems {
             self.files += 1;
-            self.keep(Problem::from(problem));
+            self.keep([Problem::from(problem)]);
         }
     }
 
@@ -69,26 +69,24 @@ impl LeftOut {
         } else {
             self.frames += 1;
         }
-        self.keep(problem);
+        self.keep([problem]);
     }
 
     /// Adds a frame, named by scenario, tick and agent, that could not be computed.
     pub fn add_failed(&mut self, frame: &str, reason: &str) {
         self.failed += 1;
-        self.keep(Problem {
+        self.keep([Problem {
             path: String::new(),
             line: None,
             field: None,
             message: format!("{frame}: {reason}"),
-        });
+        }]);
     }
 
     /// Adds the parts left out of a frame.
     fn add_parts(&mut self, frame: &Frame) {
         self.parts += frame.problems.len() as u64;
-        for problem in &frame.problems {
-            self.keep(problem.clone());
-        }
+        self.keep(frame.problems.iter().cloned());
     }
 
     /// Adds another account.
@@ -100,9 +98,7 @@ impl LeftOut {
         self.failed += other.failed;
         self.files += other.files;
         self.add_findings(other.findings.iter().cloned());
-        for problem in &other.problems {
-            self.keep(problem.clone());
-        }
+        self.keep(other.problems.iter().cloned());
     }
 
     /// True if nothing was lost. Absent agents are no loss.
@@ -128,9 +124,11 @@ impl LeftOut {
         Outcome::of(!self.is_nothing())
     }
 
-    fn keep(&mut self, problem: Problem) {
-        if self.problems.len() < KEPT {
-            self.problems.insert(problem);
+    fn keep(&mut self, problems: impl IntoIterator<Item = Problem>) {
+        for problem in problems {
+            if self.problems.len() < KEPT {
+                self.problems.insert(problem);
+            }
         }
     }
 }

@@ -13,7 +13,7 @@ use super::frame_files::RADAR;
 use super::points::Sweeps;
 use super::written_pose::WrittenPose;
 use super::yaml::{self, YamlField};
-use super::{FrameSource, Problem, Result, Tick, camera_files, points, repeats};
+use super::{FrameSource, Problem, Result, Tick, camera_files, points, poses, repeats};
 use crate::carla_pose::CarlaPose;
 use crate::frame::Frame;
 use crate::pcd::{self, PcdCloud};
@@ -110,10 +110,7 @@ impl Opv2v {
 
     fn world_from(&self, place: &CarlaPose) -> Result<Pose, InvalidPose> {
         match self.handedness {
-            Handedness::Left => {
-                let pose = place.to_pose();
-                pose.validate().map(|()| pose)
-            }
+            Handedness::Left => poses::valid(place.to_pose()),
             Handedness::Right => Pose::from_matrix(&place.left_handed_matrix()),
         }
     }

@@ -19,10 +19,16 @@ pub(super) fn box_angle_rad(angle: f64) -> Result<f64, String> {
     is_angle.then_some(angle).ok_or_else(reason)
 }
 
-/// The pose of a 3x4 matrix, row by row.
-pub(super) fn of_rows(rows: &[f64; 12]) -> Result<Pose, InvalidPose> {
-    let rows = [&rows[..], &[0.0, 0.0, 0.0, 1.0]].concat();
-    Pose::from_matrix(&Matrix4::from_row_slice(&rows))
+/// The pose of a 3x4 or 4x4 matrix, row by row.
+pub(super) fn of_rows(rows: &[f64]) -> Result<Pose, InvalidPose> {
+    let rows = rows.iter().copied().chain([0.0, 0.0, 0.0, 1.0]);
+    Pose::from_matrix(&Matrix4::from_row_iterator(rows))
+}
+
+/// The pose, if its numbers are in range.
+pub(super) fn valid(pose: impl Into<Pose>) -> Result<Pose, InvalidPose> {
+    let pose: Pose = pose.into();
+    pose.validate().map(|()| pose)
 }
 
 /// The rigid transform of a pose whose quaternion may be rounded.
@@ -34,10 +40,8 @@ pub(super) fn of_rounded(pose: &Pose) -> Result<Isometry3<f64>, String> {
         return Err(format!("quaternion of length {length:.3}, expected 1"));
     }
     let isometry = pose.isometry();
-    let checked = Pose::from(isometry).validate();
-    checked
-        .map(|()| isometry)
-        .map_err(|error| error.to_string())
+    let checked = valid(isometry).map_err(|error| error.to_string());
+    checked.map(|_| isometry)
 }
 
 impl Scenario {

@@ -5,8 +5,8 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use protocol::{
-    CavId, EgoMotion, Gnss, GnssSource, Handedness, Lidar, Limits, Payload, Radar, Stream, Topic,
-    Truth, wire,
+    CavId, EgoMotion, Gnss, GnssSource, Handedness, Lidar, Limits, Payload, Radar, Role, Stream,
+    Topic, Truth, wire,
 };
 
 use super::layout::{LayoutReader, LayoutRow};
@@ -91,15 +91,10 @@ impl Recorded {
             let stamp = &entry.header.stamp;
             let (capture_nanos, epoch) = (stamp.capture_nanos, stamp.epoch);
             match &entry.key.topic {
-                Topic::Stream {
-                    cav,
-                    stream:
-                        stream @ (Stream::Lidar
-                        | Stream::Gnss
-                        | Stream::Imu
-                        | Stream::Radar
-                        | Stream::Camera(_)),
-                } => {
+                // A replay sends the data of the sensors, and previews of the sweeps.
+                Topic::Stream { cav, stream }
+                    if stream.sender() == Role::Replay && *stream != Stream::Preview =>
+                {
                     let key = (capture_nanos, cav.clone(), *stream);
                     sensors.entry(key).or_insert_with(|| entry.clone());
                 }

@@ -70,26 +70,24 @@ impl Trajectory {
 }
 
 /// Indices of the longest selection of values that increase.
-#[expect(
-    clippy::indexing_slicing,
-    reason = "all indices are of `values`, and `length` is at most that of `ends`"
-)]
 fn longest_increasing(values: &[u64]) -> Vec<usize> {
-    // Of the selections of each length, the index of the smallest last value; and the predecessor of each value.
-    let mut ends: Vec<usize> = Vec::new();
+    // Of the selections of each length, the smallest last value and its index; and the predecessor of each value.
+    let mut ends: Vec<(u64, usize)> = Vec::new();
     let mut before: Vec<Option<usize>> = Vec::with_capacity(values.len());
-    for (index, value) in values.iter().enumerate() {
+    for (index, &value) in values.iter().enumerate() {
         // Bisection, because longer selections end in larger values.
-        let length = ends.partition_point(|&end| values[end] < *value);
-        before.push(length.checked_sub(1).map(|shorter| ends[shorter]));
-        if length == ends.len() {
-            ends.push(index);
-        } else if *value < values[ends[length]] {
-            ends[length] = index;
+        let length = ends.partition_point(|(end, _)| *end < value);
+        let shorter = length.checked_sub(1).and_then(|shorter| ends.get(shorter));
+        before.push(shorter.map(|(_, index)| *index));
+        match ends.get_mut(length) {
+            Some(end) if value < end.0 => *end = (value, index),
+            Some(_) => {}
+            None => ends.push((value, index)),
         }
     }
-    let mut selection: Vec<usize> =
-        std::iter::successors(ends.last().copied(), |&index| before[index]).collect();
+    let last = ends.last().map(|(_, index)| *index);
+    let chain = std::iter::successors(last, |index| *before.get(*index)?);
+    let mut selection: Vec<usize> = chain.collect();
     selection.reverse();
     selection
 }

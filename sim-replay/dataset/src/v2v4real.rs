@@ -12,7 +12,7 @@ use super::annotations::Annotations;
 use super::points::Sweeps;
 use super::written_pose::{WrittenPose, rigid};
 use super::yaml::{self, YamlField};
-use super::{FrameSource, Result, Tick};
+use super::{FrameSource, Result, Tick, poses};
 use crate::frame::Frame;
 use crate::pcd::PcdCloud;
 
@@ -39,9 +39,7 @@ impl FrameSource for V2v4Real {
             |id, field| self.associated_id(agent, id, field),
             |place| {
                 let lidar_from_object = Pose::from_matrix(&place.left_handed_matrix())?;
-                let pose: Pose =
-                    (world_from_lidar.isometry() * lidar_from_object.isometry()).into();
-                pose.validate().map(|()| pose)
+                poses::valid(world_from_lidar.isometry() * lidar_from_object.isometry())
             },
         );
         annotations.add_vehicle(&mut frame, pose);
@@ -110,7 +108,7 @@ mod tests {
     use super::super::opv2v::tests::write_frame;
     use super::super::yaml::numpy_tags::tests::pickled_matrix;
     use crate::frame::{Frame, ObjectClass};
-    use crate::ground_truth::{GroundTruthRule, merge};
+    use crate::ground_truth::{GroundTruthRule, merged_objects};
     use crate::{Layout, LoadOptions, ReadError};
 
     /// 30 m ahead, half a turn.
@@ -175,9 +173,9 @@ mod tests {
             assert!((a - b).abs() < 1e-9, "the same truck: {places:?}");
         }
         // Without partner: object id + 100 * agent id. The pedestrian does not count.
-        let ids: Vec<i64> = merge(&[&ego, &partner], 0, &GroundTruthRule::V2V4REAL)
+        let ids: Vec<i64> = merged_objects(&[&ego, &partner], 0, &GroundTruthRule::V2V4REAL)
             .into_iter()
-            .map(|(id, _)| id)
+            .map(|(object, _)| object.id)
             .collect();
         assert_eq!(ids, [5, 107]);
         let heading = ego.objects[0].world_from_object.yaw_rad().to_degrees();

@@ -120,7 +120,7 @@ mod tests {
             ),
             (
                 "pose: [1, 2, 3, 0, 3.6e15, 0]\n".into(),
-                "pose: [0.0, 3.6e15, 0.0], expected angles in degrees",
+                "pose: [0.0, 3600000000000000.0, 0.0], expected angles in degrees",
             ),
             (
                 "pose: far\n".into(),

@@ -43,11 +43,9 @@ impl ServiceCurve {
                 let mut done = 0;
                 let mut last: Option<&Step> = None;
                 let steps = steps.iter().map(|step| {
-                    if let Some(last) = last {
-                        done += u128::from(last.bits_per_s)
-                            * u128::from(step.from_nanos - last.from_nanos);
-                    }
-                    last = Some(step);
+                    done += last.replace(step).map_or(0, |last| {
+                        u128::from(last.bits_per_s) * u128::from(step.from_nanos - last.from_nanos)
+                    });
                     (*step, done)
                 });
                 Self::Steps(steps.collect())

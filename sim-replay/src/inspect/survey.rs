@@ -209,13 +209,13 @@ fn merged_counts(
 ) -> Vec<TickReport> {
     let mut merged = Vec::new();
     for (index, ego) in frames.iter().enumerate() {
-        let alone = ground_truth::merge(&[ego], 0, rule).len();
+        let alone = ground_truth::merged_objects(&[ego], 0, rule).len();
         let mut counts = vec![(vec![ego.cav.clone()], alone)];
         let contributors = ground_truth::contributors(frames, index, rule.comm_range_m);
         // Contributors include the ego: alone it would only repeat the entry above.
         if contributors.len() > 1 {
             let agents = contributors.iter().map(|&other| frames[other].cav.clone());
-            let together = ground_truth::merge(frames, index, rule).len();
+            let together = ground_truth::merged_objects(frames, index, rule).len();
             counts.push((agents.collect(), together));
         }
         merged.extend(counts.into_iter().map(|(agents, merged_boxes)| TickReport {

@@ -75,16 +75,17 @@ fn v2xset_scene_is_found_at_every_level() {
 #[ignore = "needs V2V_DATA"]
 fn v2xset_ground_truth_is_21_boxes_ego_only_and_26_together() {
     let [ego, partner] = v2xset_frames();
-    let ego_only = ground_truth::merge(&[&ego], 0, &GroundTruthRule::OPV2V);
-    let together = ground_truth::merge(&[&ego, &partner], 0, &GroundTruthRule::OPV2V);
+    let ego_only = ground_truth::merged_objects(&[&ego], 0, &GroundTruthRule::OPV2V);
+    let together = ground_truth::merged_objects(&[&ego, &partner], 0, &GroundTruthRule::OPV2V);
     assert_eq!((ego_only.len(), together.len()), (21, 26));
-    let lists_ego = |merged: &[(i64, protocol::Box3d)]| merged.iter().any(|(id, _)| *id == 4279);
+    let lists_ego =
+        |merged: &[(&Object, protocol::Box3d)]| merged.iter().any(|(one, _)| one.id == 4279);
     assert!(
         !lists_ego(&ego_only) && lists_ego(&together),
         "4288 lists the ego, the ego never lists itself"
     );
     assert_eq!((ego.objects.len(), partner.objects.len()), (21, 22));
-    let ego_box = together.iter().find(|(id, _)| *id == 4279).unwrap().1;
+    let ego_box = together.iter().find(|(one, _)| one.id == 4279).unwrap().1;
     assert!(
         ego_box.center_m[0].hypot(ego_box.center_m[1]) < 1.0,
         "{ego_box:?}"

@@ -3,6 +3,7 @@
 use agent::node::{self as agent_node, NodeOptions};
 use bus::shutdown::Stop;
 use bus::{Barrier, Bus, MessageStats, Publisher, PublisherOptions, Route};
+use ego_fuser::config::EgoSettings;
 use ego_fuser::node as ego_node;
 use fusion::Method;
 use protocol::{Account, DropReason, Lidar, Pace, PointCloud, ProcessId, Stream};
@@ -138,7 +139,7 @@ fn an_agent_serves_the_faster_of_two_egos_and_forgets_those_that_leave() {
                 &bus,
                 &cav("20"),
                 ego(Method::MAX),
-                &ego_node::NodeOptions::default(),
+                &ego_node::NodeOptions::from(&EgoSettings::default()),
                 &fast_stop,
             )
             .unwrap();

@@ -207,7 +207,7 @@ fn judged(
 
 /// AP at an IoU of 0.3: in both orders, and of each distance and class.
 fn all_at_30(scores: &FrameScores) -> Vec<f64> {
-    let (by_score, by_frame) = scores.average_precision();
+    let [by_score, by_frame] = scores.average_precision();
     let [by_distance, by_class] = scores.average_precision_by_part();
     let parts = by_distance.values().chain(by_class.values());
     [by_score, by_frame]

@@ -72,10 +72,10 @@ fn golden_converted_multi_scale_networks_answer_as_the_reference() {
         let (sweeps, _) = pillars(&golden);
         let batch = PillarBatch::new(
             &sweeps.iter().collect::<Vec<_>>(),
-            &network.network().pillar_grid,
+            &network.network.pillar_grid,
         );
         let [width, height, _] = network
-            .network()
+            .network
             .config
             .pillar_grid()
             .map(|count| count as i64);
@@ -88,7 +88,7 @@ fn golden_converted_multi_scale_networks_answer_as_the_reference() {
                 let theta = normalized.get(sample).get(0).narrow(0, 0, agents);
                 MapAlignment {
                     agents,
-                    theta: (!network.config().one_frame).then_some(theta),
+                    theta: (!network.config.one_frame).then_some(theta),
                 }
             })
             .collect();

@@ -2,11 +2,11 @@
 
 use ::training::loss::{LabelTensors, LossConfig, Unassigned, detection_loss};
 use dataset::average_precision::{Ordering, PrecisionRecallCurve, Scorer};
+use dataset::ground_truth::GroundTruth;
 use fusion::targets::{BOX_CODE, Labels, NEGATIVE_IOU, POSITIVE_IOU, Positive, TargetAssigner};
 use fusion::warp::{coalign, warp_to_ego};
 use fusion::{AlignedMaps, AttentionFusion, Fusion, MapMetadata, MaxFusion};
-use protocol::rotated_iou::Polygon;
-use protocol::{BevGrid, Box3d, Pose};
+use protocol::{BevGrid, Box3d, Detection, Pose};
 use tch::{Device, Kind, Tensor};
 use tests::fixtures::{Golden, assert_close, golden};
 use tests::opencood::{self, Interpolation, regroup};
@@ -77,18 +77,26 @@ fn golden_c4_average_precision() {
         .collect();
     let mut scorer = Scorer::new(&thresholds);
     for frame in 0..config["frames"].as_u64().unwrap() {
-        let footprints = |name: &str| {
+        let boxes = |name: &str| {
             let (_, corners) = golden.f32(&format!("in.{frame:02}.{name}"));
             corners
                 .as_chunks::<24>()
                 .0
                 .iter()
-                .map(footprint_of_corners)
+                .map(box_of_corners)
                 .collect::<Vec<_>>()
         };
         let (_, scores) = golden.f32(&format!("in.{frame:02}.det_scores"));
-        let found: Vec<_> = footprints("det_corners").into_iter().zip(scores).collect();
-        scorer.add_footprints(&found, &footprints("gt_corners"));
+        let found: Vec<Detection> = boxes("det_corners")
+            .into_iter()
+            .zip(scores)
+            .map(|(box3d, score)| Detection {
+                box3d,
+                score,
+                source: None,
+            })
+            .collect();
+        scorer.add(&found, &GroundTruth::of_boxes(boxes("gt_corners")));
     }
     for (tally, threshold) in scorer.tallies().iter().zip(&thresholds) {
         let prefix = format!("out.{:02.0}", threshold * 100.0);
@@ -532,10 +540,17 @@ fn box_of_hwl(&[x, y, z, h, w, l, yaw]: &[f64; 7]) -> Box3d {
     }
 }
 
-fn footprint_of_corners(corners: &[f32; 24]) -> Polygon {
-    Polygon::new(std::array::from_fn(|corner| {
-        [corners[corner * 3], corners[corner * 3 + 1]].map(f64::from)
-    }))
+/// The upright box of eight corners in the order of [`Box3d::corners`], without its place and size along z.
+fn box_of_corners(corners: &[f32; 24]) -> Box3d {
+    let [a, b, c, d] =
+        std::array::from_fn(|corner| [corners[corner * 3], corners[corner * 3 + 1]].map(f64::from));
+    let [x, y] = [0, 1].map(|axis: usize| (a[axis] + b[axis] + c[axis] + d[axis]) / 4.0);
+    let [length, width] = [[c, b], [a, b]].map(|[from, to]| [to[0] - from[0], to[1] - from[1]]);
+    Box3d {
+        center_m: [x, y, 0.0],
+        size_m: [length[0].hypot(length[1]), width[0].hypot(width[1]), 1.0],
+        heading_rad: length[1].atan2(length[0]),
+    }
 }
 
 /// The inverse of the planar part of a 4x4 transform.

@@ -473,7 +473,7 @@ fn check_heads(golden: &Golden, network: &MultiScaleNetwork, samples: &[MapAlign
     let (sweeps, _) = pillars(golden);
     let batch = PillarBatch::new(
         &sweeps.iter().collect::<Vec<_>>(),
-        &network.network().pillar_grid,
+        &network.network.pillar_grid,
     );
     let output = no_grad(|| network.forward(&batch, samples)).unwrap();
     assert_close(

@@ -357,10 +357,11 @@ fn golden_world_objects() {
         z_m: [z_low, z_high],
         ..GroundTruthRule::OPV2V
     };
-    let merged = ground_truth::merge(&[&ego], 0, &rule);
-    let ids: Vec<i64> = merged.iter().map(|(id, _)| *id).collect();
+    let merged = ground_truth::merged_objects(&[&ego], 0, &rule);
+    let ids: Vec<i64> = merged.iter().map(|(object, _)| object.id).collect();
     assert_eq!(ids, golden.i64("out.ids").1);
-    for ((id, box3d), expected) in merged.iter().zip(rows::<7>(&golden, "out.boxes_hwl")) {
+    let boxes = merged.iter().map(|(object, box3d)| (object.id, box3d));
+    for ((id, box3d), expected) in boxes.zip(rows::<7>(&golden, "out.boxes_hwl")) {
         let [x, y, z] = mirrored_point(box3d.center_m);
         let [l, w, h] = box3d.size_m;
         assert_close(

@@ -67,18 +67,10 @@ impl SweepDatabase {
 /// Retrieval with the features of the localizer's encoder as descriptor.
 #[derive(Debug)]
 pub struct Retrieval {
-    localizer: Localizer,
-    database: SweepDatabase,
-}
-
-impl Retrieval {
-    /// Retrieval from a database of descriptors of the same localizer ([`Localizer::sweep_features`]).
-    pub fn new(localizer: Localizer, database: SweepDatabase) -> Self {
-        Self {
-            localizer,
-            database,
-        }
-    }
+    /// Localizer whose encoder describes the sweeps.
+    pub localizer: Localizer,
+    /// Database of descriptors of the same localizer ([`Localizer::sweep_features`]).
+    pub database: SweepDatabase,
 }
 
 impl Localize for Retrieval {

@@ -16,6 +16,7 @@ use perception::weights::FileError;
 use protocol::NoPoseReason;
 use protocol::config::within;
 use support::file_error::AtFile;
+use support::sampling::evenly_spread;
 
 use self::branch_and_bound::{BranchAndBound, PoseCandidate};
 use self::grid::{CELL_M, RANGE_M, UprightGrid, UprightPlane, direction_bit};
@@ -157,9 +158,7 @@ fn planes_to_match(planes: &[Plane], levelled: &UnitQuaternion<f64>) -> Vec<Upri
             taken.insert((cell, direction_bit(plane.normal_rad)))
         })
         .collect();
-    let count = planes.len().min(MAX_PLANES);
-    let rows = (0..count).map(|row| row * planes.len() / count);
-    rows.map(|row| planes[row]).collect()
+    evenly_spread(&planes, MAX_PLANES)
 }
 
 impl Localize for MapSearch {
@@ -194,7 +193,7 @@ impl Localize for MapSearch {
     }
 
     fn place(&self) -> Option<&str> {
-        Some(self.map.place()).filter(|place| !place.is_empty())
+        Some(self.map.place.as_str()).filter(|place| !place.is_empty())
     }
 }
 

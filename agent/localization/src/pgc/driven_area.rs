@@ -44,18 +44,18 @@ impl DrivenArea {
         });
         let edge_m = edges_m[0].max(edges_m[1]);
         let cell_m = CELL_M.max((edge_m / MOST_CELLS / CELL_M).ceil() * CELL_M);
-        let mut counts: BTreeMap<[i64; 2], usize> = BTreeMap::new();
-        for position in positions_m {
-            // Floor, as coordinates may be negative: a cast alone rounds towards zero.
-            *counts
-                .entry(position.map(|metres| (metres / cell_m).floor() as i64))
-                .or_default() += 1;
-        }
-        Self::of_counts(cell_m, counts)
+        Self::counted(cell_m, positions_m.iter().map(|position| (*position, 1)))
     }
 
-    /// Area of the cells of this edge, metres, with their numbers of sweeps.
-    fn of_counts(cell_m: f64, counts: BTreeMap<[i64; 2], usize>) -> Self {
+    /// Area of cells of this edge, metres, from places with their numbers of sweeps.
+    fn counted(cell_m: f64, places: impl Iterator<Item = ([f64; 2], usize)>) -> Self {
+        let mut counts: BTreeMap<[i64; 2], usize> = BTreeMap::new();
+        for (place_m, sweeps) in places {
+            // Floor, as coordinates may be negative: a cast alone rounds towards zero.
+            let cell = place_m.map(|metres| (metres / cell_m).floor() as i64);
+            let count = counts.entry(cell).or_default();
+            *count = count.saturating_add(sweeps);
+        }
         let cells = counts.into_iter().map(|(cell, sweeps)| DrivenCell {
             corner_m: cell.map(|k| k as f64 * cell_m),
             sweeps,
@@ -69,18 +69,13 @@ impl DrivenArea {
     /// This area together with that of earlier drives, on the coarser of the two grids.
     pub fn merged(&self, earlier: &Self) -> Self {
         let cell_m = self.cell_m.max(earlier.cell_m);
-        let mut counts = BTreeMap::new();
-        for area in [self, earlier] {
-            for cell in &area.cells {
-                // By its middle, as grids need not have corners in common.
-                let middle = cell.corner_m.map(|metres| metres + 0.5 * area.cell_m);
-                let count: &mut usize = counts
-                    .entry(middle.map(|metres| (metres / cell_m).floor() as i64))
-                    .or_default();
-                *count = count.saturating_add(cell.sweeps);
-            }
-        }
-        Self::of_counts(cell_m, counts)
+        let places = [self, earlier].into_iter().flat_map(|area| {
+            // By its middle, as grids need not have corners in common.
+            let middle = move |metres: f64| metres + 0.5 * area.cell_m;
+            let cells = area.cells.iter();
+            cells.map(move |cell| (cell.corner_m.map(middle), cell.sweeps))
+        });
+        Self::counted(cell_m, places)
     }
 
     /// The area that a head states, if it states a valid one.

@@ -79,15 +79,12 @@ impl SceneEncoder {
         })
     }
 
-    /// Reads an encoder from a weights file that contains its configuration, frozen. Returns the file's SHA-256 beside
-    /// it.
+    /// Reads an encoder from a weights file that contains its configuration, frozen.
     ///
     /// # Errors
     /// [`LocalizerError`] when the file is missing, truncated or of another kind.
-    pub fn load(path: &Path, device: Device) -> Result<(Self, String), LocalizerError> {
-        let weights = Weights::load(path)?;
-        let encoder = Self::from_weights(&weights, device)?;
-        Ok((encoder, weights.sha256().to_owned()))
+    pub fn load(path: &Path, device: Device) -> Result<Self, LocalizerError> {
+        Self::from_weights(&Weights::load(path)?, device)
     }
 
     /// The encoder of a file already read, frozen.

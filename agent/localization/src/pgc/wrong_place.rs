@@ -17,7 +17,7 @@ const LEVEL_M: f32 = 0.3;
 /// The hint, with the place in the head's metadata and the map of the scene, as far as they are known.
 pub fn wrong_place_hint(sweeps: u64, head: &Path, scene_map: Option<&str>) -> String {
     let place = config_of(head).map(|config| config.scene_name);
-    let place = place.or_else(|| Some(SurfelMap::load(head).ok()?.place().to_owned()));
+    let place = place.or_else(|| Some(SurfelMap::load(head).ok()?.place));
     let head = head.display().to_string();
     hint(sweeps, &head, place.as_deref(), scene_map)
 }

@@ -10,6 +10,8 @@ use nalgebra::Isometry3;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
+use crate::tracker::seconds;
+
 /// Age up to which accepted poses enter the speed estimate, seconds.
 const SPEED_WINDOW_S: f64 = 1.5;
 /// Shortest time between two poses that a speed is computed from, seconds: below, their errors weigh too much.
@@ -127,25 +129,26 @@ impl MotionGate {
         self.elsewhere.clear();
         self.accepted.push_back(pose);
         self.accepted
-            .retain(|kept| seconds(kept, &pose) <= SPEED_WINDOW_S);
+            .retain(|kept| seconds(kept.capture_nanos, pose.capture_nanos) <= SPEED_WINDOW_S);
     }
 
     /// True if a pose is recent enough to check a later one against.
     fn remembers(&self, earlier: &TimedPose, later: &TimedPose) -> bool {
-        (0.0..=self.config.memory_s).contains(&seconds(earlier, later))
+        let time_s = seconds(earlier.capture_nanos, later.capture_nanos);
+        (0.0..=self.config.memory_s).contains(&time_s)
     }
 
     /// Speed over the last accepted poses, if they suffice.
     fn speed_mps(&self) -> Option<f64> {
         let (first, last) = (self.accepted.front()?, self.accepted.back()?);
-        let time_s = seconds(first, last);
+        let time_s = seconds(first.capture_nanos, last.capture_nanos);
         (time_s >= SPEED_BASE_S).then(|| distance_m(first, last) / time_s)
     }
 
     /// True if a vehicle with this speed, or any, can be at `to` after `from`.
     fn can_reach(&self, from: &TimedPose, to: &TimedPose, speed_mps: Option<f64>) -> bool {
         let config = &self.config;
-        let time_s = seconds(from, to);
+        let time_s = seconds(from.capture_nanos, to.capture_nanos);
         // The speed is computed from poses with errors up to the slack, over a second or so.
         let fastest = speed_mps.map_or(config.max_speed_mps, |speed| {
             speed + config.position_slack_m / SPEED_WINDOW_S + config.max_acceleration_mps2 * time_s
@@ -156,11 +159,6 @@ impl MotionGate {
         let may_turn_deg = config.rotation_slack_deg + config.max_turn_deg_per_s * time_s;
         distance_m(from, to) <= reach_m && turn_deg <= may_turn_deg
     }
-}
-
-/// Time from one pose to another; negative if the other is earlier.
-fn seconds(from: &TimedPose, to: &TimedPose) -> f64 {
-    (to.capture_nanos as f64 - from.capture_nanos as f64) * 1e-9
 }
 
 fn distance_m(a: &TimedPose, b: &TimedPose) -> f64 {

@@ -189,7 +189,15 @@ impl NoisyPose {
         let step_nanos = self.config.step_s * 1e9;
         let step = (capture_nanos as f64 / step_nanos).round() as u64;
         if let Some(table) = &self.table {
-            return replayed(table.row(self.first_row(cav), step), pose);
+            // Vehicles start at different rows of the table, so that their errors differ.
+            let key = noise::key(self.config.seed, cav);
+            let first_row = u64::from_le_bytes(std::array::from_fn(|byte| key[byte]));
+            return match table.row(first_row, step) {
+                TableRow::Pose { error, confidence } => {
+                    PoseEstimate::new(error.added_in_vehicle(pose), confidence)
+                }
+                TableRow::NoPose => no_pose(NoPoseReason::TooFewInliers),
+            };
         }
         let error = match self.config.mode {
             NoiseMode::Fixed => self.config.fixed(),
@@ -211,12 +219,6 @@ impl NoisyPose {
         let confidence = 1.0 / (1.0 + error.distance_m().powi(2));
         PoseEstimate::new(error.added_in_world(pose), confidence as f32)
     }
-
-    /// Vehicles start at different rows of the table, so that their errors differ.
-    fn first_row(&self, cav: &CavId) -> u64 {
-        let key = noise::key(self.config.seed, cav);
-        u64::from_le_bytes(std::array::from_fn(|byte| key[byte]))
-    }
 }
 
 impl PoseSource for NoisyPose {
@@ -225,15 +227,6 @@ impl PoseSource for NoisyPose {
             Some(pose) => self.disturbed(input.cav, input.capture_nanos, pose),
             None => NO_SOURCE,
         }
-    }
-}
-
-fn replayed(row: TableRow, pose: &Pose) -> PoseEstimate {
-    match row {
-        TableRow::Pose { error, confidence } => {
-            PoseEstimate::new(error.added_in_vehicle(pose), confidence)
-        }
-        TableRow::NoPose => no_pose(NoPoseReason::TooFewInliers),
     }
 }
 

@@ -71,19 +71,6 @@ impl Default for TrackedPoseConfig {
     }
 }
 
-impl TrackedPoseConfig {
-    /// Checks the values; files are not opened.
-    ///
-    /// # Errors
-    /// [`FieldError`] of the first value that is out of range.
-    pub fn validate(&self) -> Result<(), FieldError> {
-        within("tracked.min_confidence", self.min_confidence, 0.0, 1.0)?;
-        within("tracked.measure_every", self.measure_every, 1, 100)?;
-        within("tracked.global_period_s", self.global_period_s, 0.0, 3600.0)?;
-        within("tracked.max_coast_s", self.max_coast_s, 0.0, 60.0)
-    }
-}
-
 impl PoseSettings for TrackedPoseConfig {
     fn build(&self, inference: Inference) -> Result<Box<dyn PoseSource>, PoseSourceError> {
         let localizer = TrackedPose::localizer(self, inference)?;
@@ -92,7 +79,10 @@ impl PoseSettings for TrackedPoseConfig {
 
     fn validate(&self) -> Result<(), FieldError> {
         require_file("tracked.head", "--head", &self.head)?;
-        Self::validate(self)
+        within("tracked.min_confidence", self.min_confidence, 0.0, 1.0)?;
+        within("tracked.measure_every", self.measure_every, 1, 100)?;
+        within("tracked.global_period_s", self.global_period_s, 0.0, 3600.0)?;
+        within("tracked.max_coast_s", self.max_coast_s, 0.0, 60.0)
     }
 
     fn networks(&mut self) -> Option<([&mut PathBuf; 3], &mut f64)> {
@@ -672,10 +662,12 @@ mod tests {
     #[test]
     fn settings_out_of_range_are_named() {
         let unmeasured = TrackedPoseConfig {
+            head: "head".into(),
             measure_every: 0,
             ..Default::default()
         };
         let backwards = TrackedPoseConfig {
+            head: "head".into(),
             max_coast_s: -1.0,
             ..Default::default()
         };

@@ -24,7 +24,7 @@ use localization::pgc::head_files::{encoder_or_named, head_config};
 use localization::pgc::pose_solver::{PoseSolver, Solver};
 use localization::pgc::wrong_place::wrong_place_hint;
 use localization::pgc::{Localize, Localizer, stored_confidence};
-use localization::pose_source::{PoseSource, TrackedPose, TrackedPoseConfig};
+use localization::pose_source::{PoseSource, PoseSourceConfig, TrackedPose, TrackedPoseConfig};
 use localization::registration::icp::IcpConfig;
 use localization::registration::icp::surfel_map::SurfelMap;
 use localization::registration::ransac::RansacConfig;
@@ -233,7 +233,9 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     }
     let is_lost = summary.no_pose == summary.sweeps && args.uses_head();
     if let ([(head, scenes)], true) = (&groups[..], is_lost) {
-        let (sweeps, map) = (summary.sweeps as u64, map_text(scenes));
+        let maps = generated_maps(scenes).unwrap_or_default();
+        let map = maps.iter().flatten().next().map(ToString::to_string);
+        let sweeps = summary.sweeps as u64;
         output::note(wrong_place_hint(sweeps, head, map.as_deref()));
     }
     let tracked = args.tracked.then(|| LocalizationSummary::of(&tracked));
@@ -326,7 +328,8 @@ impl Args {
         let mut config = self.tracker.0.clone();
         config.encoder = self.encoder(head)?;
         config.head = head.to_owned();
-        config.validate().map_err(BadInput::of)?;
+        let checked = PoseSourceConfig::Tracked(config.clone()).validate();
+        checked.map_err(BadInput::of)?;
         let localizer = TrackedPose::localizer(&config, self.inference()?).map_err(BadInput::of)?;
         let source = TrackedPose::new(self.registered(localizer)?, config);
         Ok(Subject::Source(Box::new(source)))
@@ -566,12 +569,6 @@ fn report_line(report: &FitReport) -> String {
         "fitted to {sweeps} poses: rejects {bad_rejected} of {bad} bad ones, {good_rejected} of {good} good ones; of the \
          others at most {limit:.2} % are bad (95 % limit)"
     )
-}
-
-/// Name of the first generated map.
-fn map_text(scenes: &[PathBuf]) -> Option<String> {
-    let maps = generated_maps(scenes).ok()?;
-    Some(maps.into_iter().flatten().next()?.to_string())
 }
 
 /// Report as text: the numbers of all rows first, a dash for a missing one; then the rows, some only where there is

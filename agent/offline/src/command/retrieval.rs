@@ -37,7 +37,10 @@ pub(crate) fn by_encoder(
     let database = SweepDatabase::new(&sweeps);
     let database = database.ok_or_else(|| Error::NoSweeps(folders.to_vec(), left_out.reasons()));
     let database = database.map_err(BadInput::of)?;
-    Ok(Box::new(Retrieval::new(localizer, database)))
+    Ok(Box::new(Retrieval {
+        localizer,
+        database,
+    }))
 }
 
 /// Retrieval by polar descriptors.

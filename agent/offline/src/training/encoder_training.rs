@@ -69,7 +69,7 @@ pub fn train_encoder(
     };
     let trainer = Trainer::begin(run, &variables, None, Instant::now())?;
     let mut trainer = trainer.on_data(&store.data.sha256)?;
-    let (batch, anchors) = (run.batch as u64, maker.anchors());
+    let (batch, anchors) = (run.batch as u64, maker.anchors.len());
     let mut training = Training {
         config,
         observe,

@@ -65,7 +65,8 @@ pub(crate) struct PairMaker {
     seed: u64,
     /// For each sweep those in range, of its own drive and of others.
     partners: Arc<Vec<[Vec<u32>; 2]>>,
-    anchors: Arc<Vec<u32>>,
+    /// Sweeps that have a partner.
+    pub(crate) anchors: Arc<Vec<u32>>,
 }
 
 impl PairMaker {
@@ -94,11 +95,6 @@ impl PairMaker {
             partners: Arc::new(partners),
             anchors: Arc::new(anchors),
         })
-    }
-
-    /// Number of sweeps that have a partner.
-    pub(crate) fn anchors(&self) -> usize {
-        self.anchors.len()
     }
 
     /// Pair `number`.

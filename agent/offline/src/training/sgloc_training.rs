@@ -41,7 +41,7 @@ pub fn train_sgloc(config: &SgLocTrainConfig, observe: &mut Observe<'_>) -> Resu
     let run = &config.run;
     run.start()?;
     let list = Arc::new(SweepList::open(&config.scenes)?);
-    let (encoder, _) = SceneEncoder::load(&config.encoder, run.device)?;
+    let encoder = SceneEncoder::load(&config.encoder, run.device)?;
     let encoder_config = encoder.config().clone();
     let encoder = CellEncoder::sparse(encoder, run.device);
     let cache = FeatureCache::build(&list, &encoder, SweepAugmentation::NONE, run, observe)?;

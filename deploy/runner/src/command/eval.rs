@@ -74,7 +74,8 @@ pub(crate) struct Arguments {
     #[arg(long, value_enum, default_value_t)]
     precision: InferencePrecision,
     /// Instead: a file of tables, rows of methods and columns of conditions; cells that are done are kept in --out.
-    #[arg(long, value_name = "FILE", conflicts_with_all = of_one_table(), requires = "out")]
+    #[arg(long, value_name = "FILE", requires = "out")]
+    #[arg(conflicts_with_all = OF_ONE_TABLE.iter().chain(PoseSourceConfig::OPTION_GROUPS).copied())]
     table: Option<PathBuf>,
     #[command(flatten)]
     slices: SliceArgs,
@@ -158,11 +159,6 @@ pub(crate) struct Arguments {
     /// Print JSON in the shape of metrics.json (a list of them for several methods) instead of a table.
     #[arg(long)]
     json: bool,
-}
-
-fn of_one_table() -> impl Iterator<Item = &'static str> {
-    let options = OF_ONE_TABLE.iter();
-    options.chain(PoseSourceConfig::OPTION_GROUPS).copied()
 }
 
 fn at_most(count: u64) -> usize {

@@ -30,7 +30,7 @@ use training::feature_store::{FeatureStore, KeptMaps, MapSource};
 use crate::cached_poses;
 use crate::evaluated_frame::{judge, metrics};
 use crate::experiment::cell::{Cell, CellKey};
-use crate::experiment::frame_files::{self, FrameFiles};
+use crate::experiment::frame_files;
 use crate::scenario::fingerprint::files_of;
 use crate::scenario::weights_choice::weights_of;
 
@@ -245,17 +245,14 @@ impl Trial {
     /// File of the weights of a method.
     fn weights(&self, method: Method) -> Result<PathBuf> {
         let weights = &self.setup.models.weights;
-        Ok(weights_of(weights, method, self.sends_boxes())?)
+        // True if a vehicle sends boxes where a method fuses feature maps.
+        let sends_boxes = self.settings().any(|settings| settings.boxes.is_some());
+        Ok(weights_of(weights, method, sends_boxes)?)
     }
 
     /// Settings of all vehicles, then those of single ones.
     fn settings(&self) -> impl Iterator<Item = &AgentSettings> {
         std::iter::once(&self.setup.agents).chain(self.setup.vehicles.values())
-    }
-
-    /// True if a vehicle sends boxes where a method fuses feature maps.
-    fn sends_boxes(&self) -> bool {
-        self.settings().any(|settings| settings.boxes.is_some())
     }
 
     /// Digests of all that these settings are applied to.
@@ -346,7 +343,8 @@ fn judged(
     let is_timed = link.is_some() && *compute != ComputeTimes::default();
     let mut scores: Option<FrameScores> = None;
     let out = trial.out.as_ref();
-    let mut files = out.map(|out| FrameFiles::create(out, method)).transpose()?;
+    let files = out.map(|out| frame_files::create(out, method));
+    let mut files = files.transpose()?;
     for scenario in data.chosen(trial.scenarios) {
         let Some(ego) = scenario.agents.first() else {
             continue;
@@ -361,7 +359,7 @@ fn judged(
                 return ControlFlow::Continue(());
             }
             let mut files = files.iter_mut();
-            let written = files.try_for_each(|files| files.add(&scenario.name, &frame));
+            let written = files.try_for_each(|files| files.add(Some(&scenario.name), &frame));
             judge(scores, frame, is_timed);
             on_frame();
             written
@@ -376,7 +374,8 @@ fn judged(
         let (path, reasons) = (trial.dataset.display(), evaluator.left_out().reasons());
         format!("{path}: there is no frame in it that can be evaluated{reasons}")
     })?;
-    files.map(|files| files.finish(&scores)).transpose()?;
+    let finished = files.map(|files| frame_files::finish(files, &scores));
+    finished.transpose()?;
     Ok((scores, evaluator))
 }
 

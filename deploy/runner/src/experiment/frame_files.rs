@@ -3,7 +3,6 @@
 use std::collections::BTreeMap;
 use std::fs;
 use std::io::ErrorKind;
-use std::ops::ControlFlow;
 use std::path::Path;
 
 use anyhow::{Context, Result};
@@ -11,7 +10,6 @@ use anyhow::{Context, Result};
 use deploy::operate::run_folder::frames_csv;
 use deploy::score::FrameScores;
 use deploy::score::metrics::{self, Metrics};
-use ego_fuser_offline::evaluation::EvaluatedFrame;
 use fusion::Method;
 use support::atomic_file;
 use support::cli::{BadInput, NotWritten};
@@ -20,59 +18,41 @@ use support::file_error::check_folder;
 use crate::experiment::cell::file_name;
 use crate::frame_lines::FrameLines;
 
-/// Files of one method in a folder of its own: `detections.jsonl`, `tracks.jsonl`, `truth.jsonl`, `frames.csv`,
-/// `precision_recall.csv` and, at the end, `metrics.json`. The first three are those of a run, with the name of the scenario.
-pub(crate) struct FrameFiles {
-    lines: FrameLines,
-    /// Scenario of each frame so far.
-    scenarios: Vec<String>,
+/// Begins the files of one method in a folder of its own in `out`: `detections.jsonl`, `tracks.jsonl` and `truth.jsonl`,
+/// those of a run, with the name of the scenario. [`finish`] adds `frames.csv` and `precision_recall.csv`, and
+/// [`write_metrics`], at the end, `metrics.json`.
+///
+/// # Errors
+/// An error when there are such files already, or they cannot be written.
+pub(crate) fn create(out: &Path, method: Method) -> Result<FrameLines> {
+    check_folder(out).map_err(|error| BadInput::new(format!("--out {error}")))?;
+    let folder = out.join(file_name(method));
+    atomic_file::create_folder(out)
+        .and_then(|()| fs::create_dir(&folder))
+        .and_then(|()| atomic_file::sync_name(&folder))
+        .and_then(|()| FrameLines::create(&folder))
+        .map_err(|error| match error.kind() {
+            // One that exists is the user's choice, any other is not.
+            ErrorKind::AlreadyExists => {
+                anyhow::Error::from(error).context(folder.display().to_string())
+            }
+            _ => anyhow::Error::from(error).context(NotWritten(folder.clone())),
+        })
 }
 
-impl FrameFiles {
-    /// Empty files of a method in a folder of `out`.
-    ///
-    /// # Errors
-    /// An error when there are such files already, or they cannot be written.
-    pub(crate) fn create(out: &Path, method: Method) -> Result<Self> {
-        check_folder(out).map_err(|error| BadInput::new(format!("--out {error}")))?;
-        let folder = out.join(file_name(method));
-        let lines = atomic_file::create_folder(out)
-            .and_then(|()| fs::create_dir(&folder))
-            .and_then(|()| atomic_file::sync_name(&folder))
-            .and_then(|()| FrameLines::create(&folder))
-            .map_err(|error| match error.kind() {
-                // One that exists is the user's choice, any other is not.
-                ErrorKind::AlreadyExists => {
-                    anyhow::Error::from(error).context(folder.display().to_string())
-                }
-                _ => anyhow::Error::from(error).context(NotWritten(folder.clone())),
-            })?;
-        Ok(Self {
-            lines,
-            scenarios: Vec::new(),
-        })
-    }
-
-    /// Adds a frame of a scenario; a break after an error, which [`Self::finish`] returns.
-    pub(crate) fn add(&mut self, scenario: &str, frame: &EvaluatedFrame) -> ControlFlow<()> {
-        self.scenarios.push(scenario.to_owned());
-        self.lines.add(Some(scenario), frame)
-    }
-
-    /// Writes the rest, with the scores of the same frames.
-    ///
-    /// # Errors
-    /// An error with the first error of the operating system.
-    pub(crate) fn finish(self, scores: &FrameScores) -> Result<()> {
-        let folder = self.lines.folder.clone();
-        let frames = frames_csv(scores.records(), &BTreeMap::new(), Some(&self.scenarios));
-        let curve = scores.precision_recall_csv();
-        self.lines
-            .finish()
-            .and_then(|()| atomic_file::write(&folder.join("frames.csv"), frames))
-            .and_then(|()| atomic_file::write(&folder.join("precision_recall.csv"), curve))
-            .with_context(|| folder.display().to_string())
-    }
+/// Writes the rest, with the scores of the same frames.
+///
+/// # Errors
+/// An error with the first error of the operating system.
+pub(crate) fn finish(lines: FrameLines, scores: &FrameScores) -> Result<()> {
+    let folder = lines.folder.clone();
+    let frames = frames_csv(scores.records(), &BTreeMap::new(), Some(&lines.scenarios));
+    let curve = scores.precision_recall_csv();
+    lines
+        .finish()
+        .and_then(|()| atomic_file::write(&folder.join("frames.csv"), frames))
+        .and_then(|()| atomic_file::write(&folder.join("precision_recall.csv"), curve))
+        .with_context(|| folder.display().to_string())
 }
 
 /// Writes `metrics.json` into the folder of a method in `out`.

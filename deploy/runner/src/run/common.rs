@@ -2,12 +2,14 @@
 
 use std::path::PathBuf;
 
+use bus::{present, process_id};
 use deploy::operate::network::{Network, RouterEndpoint};
 use deploy::operate::run_folder::{RunFolder, name_of_now};
 use deploy::operate::supervise::ProcessSpec;
 use deploy::report::RunReport;
 use deploy::score::metrics::Metrics;
-use protocol::{Reconciliation, RunId};
+use deploy::score::scorer_cav;
+use protocol::{KeyExpr, Reconciliation, Role, RunId};
 
 use crate::fleet::Fleet;
 use crate::run::RunError;
@@ -42,11 +44,9 @@ pub struct RunResult {
     pub unwritten: Vec<String>,
     /// Processes that failed in their task, with the reason.
     pub failures: Vec<String>,
-    /// Observed causes of lost messages: outages of the router, pauses of the run, ends of processes.
-    pub causes: Vec<String>,
     /// Changes that would let the fleet answer more ticks; `None` in simulation time, where it answers all.
     pub remedies: Option<String>,
-    /// Pace, stages and resources.
+    /// Pace, stages, resources, and observed causes of lost messages.
     pub report: RunReport,
     /// Picture of one fused frame, if one could be drawn.
     pub picture: Option<PathBuf>,
@@ -79,13 +79,21 @@ pub(super) fn check_free(
     run: &RunId,
     specs: &[ProcessSpec],
 ) -> Result<(), RunError> {
-    let processes = place.present(network, run, specs)?;
+    // A router of its own is new, so nobody can be present on it.
+    if network.connect.is_none() {
+        return Ok(());
+    }
+    let scorer = process_id(Role::Scorer, &scorer_cav());
+    let mut processes = present(&place.session, KeyExpr::everyone_alive(run).as_str())?;
+    processes.retain(|process| {
+        *process == scorer || specs.iter().any(|spec| spec.name == process.as_str())
+    });
     if processes.is_empty() {
         return Ok(());
     }
     Err(RunError::Live {
         run: run.clone(),
         router: place.endpoint.to_string(),
-        processes,
+        processes: processes.into_iter().collect(),
     })
 }

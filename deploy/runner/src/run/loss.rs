@@ -56,7 +56,7 @@ fn help(result: &RunResult) -> Option<String> {
     let without_pose = dropped.get(&DropReason::NoPose).copied().unwrap_or(0);
     let mut late = OVERLOAD.iter().filter_map(|reason| dropped.get(reason));
     let log = format!("see {}", result.folder.path().join("log").display());
-    let mut causes = result.causes.clone();
+    let mut causes = result.report.causes.clone();
     // A failure is listed among the reasons already.
     causes.retain(|cause| !result.failures.contains(cause));
     if result.interrupted && result.metrics.ticks > 0 {

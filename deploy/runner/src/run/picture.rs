@@ -115,7 +115,16 @@ impl Picture<'_> {
         }
         // The ego last, so that its points are on top.
         for (view, colour) in self.coloured_views().rev() {
-            self.draw_points(view, colour, &plane)?;
+            let ego_from_cav = view.ego_from_cav.isometry();
+            for &[x, y, z, _] in view.xyzi {
+                let point =
+                    ego_from_cav * nalgebra::Point3::new(f64::from(x), f64::from(y), f64::from(z));
+                // The ground only indicates the road; objects on it are bright.
+                let opacity = if point.z < GROUND_Z_M { 0.3 } else { 0.85 };
+                if self.is_near(point.x, point.y, 0.0) {
+                    plane.draw_pixel((point.x, point.y), &colour.mix(opacity))?;
+                }
+            }
         }
         for truth in &self.truth {
             self.draw_box(truth, TRUTH, &plane)?;
@@ -151,25 +160,6 @@ impl Picture<'_> {
         [(self.x_m, x), (self.y_m, y)]
             .into_iter()
             .all(|([low, high], value)| (low - margin_m..=high + margin_m).contains(&value))
-    }
-
-    fn draw_points(
-        &self,
-        view: &CavView<'_>,
-        colour: RGBColor,
-        plane: &PlanView<'_>,
-    ) -> Result<()> {
-        let ego_from_cav = view.ego_from_cav.isometry();
-        for &[x, y, z, _] in view.xyzi {
-            let point =
-                ego_from_cav * nalgebra::Point3::new(f64::from(x), f64::from(y), f64::from(z));
-            // The ground only indicates the road; objects on it are bright.
-            let opacity = if point.z < GROUND_Z_M { 0.3 } else { 0.85 };
-            if self.is_near(point.x, point.y, 0.0) {
-                plane.draw_pixel((point.x, point.y), &colour.mix(opacity))?;
-            }
-        }
-        Ok(())
     }
 
     /// The outline, with a stroke from the centre to the front.

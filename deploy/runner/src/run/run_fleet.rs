@@ -349,10 +349,8 @@ fn write(
     metrics.provenance = provenance.clone().map(Provenance::with_command);
     let mut written = vec![folder.write_json(deploy::score::metrics::FILE, &metrics)];
     let remedies = remedies(fleet, capacity.as_ref());
-    let run_report = RunReport {
-        causes: watched.causes.clone(),
-        ..RunReport::new(run, &metrics, board.records(), &scored.stats, capacity)
-    };
+    let mut run_report = RunReport::new(run, &metrics, board.records(), &scored.stats, capacity);
+    run_report.causes.clone_from(&watched.causes);
     written.push(folder.write_json(report::FILE, &run_report));
     let frames = frames_csv(board.records(), &swept(&folder.file(SWEEP_LOG)), None);
     written.push(folder.write("frames.csv", &frames));
@@ -387,7 +385,6 @@ fn write(
         killed: watched.killed.clone(),
         unwritten,
         failures: watched.failures.clone(),
-        causes: watched.causes.clone(),
         remedies: Some(remedies),
         report: run_report,
         picture,

@@ -42,29 +42,21 @@ pub fn run_scenario(scenario: &Scenario, options: &RunOptions) -> Result<RunResu
     // Written into scenario.yaml with the rest, so that the run can be repeated with these times.
     stepped.compute = Some(compute);
     evaluator.set_compute(compute);
+    let in_processes = stepped.processes;
     in_folder(&fleet, options, |run, folder| {
-        go(&fleet, &mut evaluator, (run, folder), options)
+        let mut running = None;
+        if in_processes {
+            let (processes, remote) =
+                AgentProcesses::start(&fleet, run, folder, &options.programs)?;
+            evaluator.set_processes(Some(remote));
+            running = Some(processes);
+        }
+        let board = play(&fleet, &mut evaluator, folder)?;
+        evaluator.set_processes(None);
+        let killed = running.map(AgentProcesses::end).unwrap_or_default();
+        let result = write(&fleet, &evaluator, &board, (run, folder.clone()), options)?;
+        Ok(RunResult { killed, ..result })
     })
-}
-
-/// Runs a fleet under the given run name in the given folder.
-fn go(
-    fleet: &Fleet,
-    evaluator: &mut Evaluator,
-    (run, folder): (&RunId, &RunFolder),
-    options: &RunOptions,
-) -> Result<RunResult> {
-    let mut running = None;
-    if { fleet.scenario.stepped }.is_some_and(|stepped| stepped.processes) {
-        let (processes, remote) = AgentProcesses::start(fleet, run, folder, &options.programs)?;
-        evaluator.set_processes(Some(remote));
-        running = Some(processes);
-    }
-    let board = play(fleet, evaluator, folder)?;
-    evaluator.set_processes(None);
-    let killed = running.map(AgentProcesses::end).unwrap_or_default();
-    let result = write(fleet, evaluator, &board, (run, folder.clone()), options)?;
-    Ok(RunResult { killed, ..result })
 }
 
 /// Computes all ticks; detections are appended to their file.
@@ -132,7 +124,6 @@ fn write(
         killed: Vec::new(),
         unwritten: Vec::new(),
         failures: Vec::new(),
-        causes: Vec::new(),
         remedies: None,
         report,
         picture,

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use bus::Endpoint;
 use perception::compute_device::ComputeDevice;
-use protocol::config::{FieldError, above_zero, within};
+use protocol::config::{FieldError, above_zero, require, within};
 use support::file_error::{AtFile, FileError};
 
 use super::{Clock, Scenario};
@@ -123,10 +123,8 @@ impl Scenario {
     fn check_clock(&self) -> Result<(), FieldError> {
         if self.clock == Clock::Wall {
             let rule = "must be left out unless clock is stepped";
-            let given = self
-                .stepped
-                .map(|_| FieldError::new("stepped", "given", rule));
-            return given.map_or(Ok(()), Err);
+            let is_left_out = self.stepped.is_none();
+            return require(is_left_out, "stepped", format_args!("given"), rule);
         }
         let (scene, remote) = (&self.scene, self.remote_agents.first());
         let off = "must be false with clock stepped";

@@ -56,25 +56,16 @@ impl FieldOverride {
 
     /// Sets the field in a document; sections on the way that are missing or have no fields are made.
     fn set(&self, mut document: Value, value: &Value) -> Value {
-        let Some((field, sections)) = self.path.split_last() else {
-            return document;
-        };
         let mut place = &mut document;
-        for section in sections {
-            place = fields_of(place)
-                .entry(section.as_str())
-                .or_insert(Value::Null);
+        for field in &self.path {
+            if !place.is_object() {
+                *place = Value::Object(Map::new());
+            }
+            place = &mut place[field];
         }
-        fields_of(place).insert(field.clone(), value.clone());
+        *place = value.clone();
         document
     }
-}
-
-fn fields_of(place: &mut Value) -> &mut Map<String, Value> {
-    if !place.is_object() {
-        *place = Value::Object(Map::new());
-    }
-    place.as_object_mut().expect("it has just been made one")
 }
 
 #[cfg(test)]

@@ -31,6 +31,7 @@ pub use field_override::FieldOverride;
 pub use overrides::AgentOverrides;
 
 use support::provenance::Provenance;
+use support::sampling::distinct;
 
 /// A deployment: its scene, vehicles, method and network.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -130,13 +131,7 @@ impl Scenario {
 
     /// Pose sources of the vehicles, each once.
     pub fn poses(&self) -> Vec<PoseSourceConfig> {
-        let mut poses: Vec<PoseSourceConfig> = Vec::new();
-        for AgentSettings { pose, .. } in self.settings() {
-            if !poses.contains(&pose) {
-                poses.push(pose);
-            }
-        }
-        poses
+        distinct(self.settings().map(|settings| settings.pose))
     }
 
     /// True if a vehicle sends boxes where the method fuses feature maps.

@@ -121,7 +121,7 @@ fn a_frame_is_judged_against_everyones_truth() {
         (Some(80.0), 1000, 1300)
     );
     assert_eq!(record.ego_error_m, Some(1.0));
-    let (global, _) = scores.average_precision();
+    let [global, _] = scores.average_precision();
     assert_eq!(
         global.at_50,
         Some(1.0),
@@ -212,7 +212,7 @@ fn the_three_precisions_differ_in_what_they_count() {
     }
     scores.close();
     // Five of the six boxes of the answered ticks, and five of the eight of all.
-    assert!(is_near(scores.average_precision().0.at_50, 5.0 / 6.0));
+    assert!(is_near(scores.average_precision()[0].at_50, 5.0 / 6.0));
     assert!(is_near(scores.live.unanswered_empty().at_50, 5.0 / 8.0));
     // Nothing is published by tick 0; its result is the newest at the three that follow: 6 of 8 boxes.
     assert!(is_near(scores.live.streaming().unwrap().at_50, 6.0 / 8.0));

@@ -27,7 +27,7 @@ impl CloudIcp {
 impl AlignmentMethod for CloudIcp {
     fn prepare(&mut self, vehicle: &AlignInput<'_>) -> Result<Message, AlignError> {
         let decimate = IcpSource::of_sweep(&vehicle.frame.points.xyzi);
-        let points = decimate.points_m().iter();
+        let points = decimate.points_m.iter();
         let xyzi = points.map(|p| [p.x as f32, p.y as f32, p.z as f32, 0.0]);
         let points = PointCloud {
             xyzi: xyzi.collect(),

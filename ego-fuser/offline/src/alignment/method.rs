@@ -40,15 +40,14 @@ pub(super) fn pose_difference(own: &PoseEstimate, received: &PoseEstimate) -> Al
     }
 }
 
-type Construct = Box<dyn Fn() -> Box<dyn AlignmentMethod>>;
-
 /// An alignment method with its settings; each scene has an instance of its own.
 pub struct AlignmentSpec {
     /// Name in tables.
     pub name: String,
     /// True if it uses [`AlignInput::boxes`].
     pub needs_boxes: bool,
-    construct: Construct,
+    /// The method at the beginning of a scene.
+    pub(crate) for_scene: Box<dyn Fn() -> Box<dyn AlignmentMethod>>,
 }
 
 impl AlignmentSpec {
@@ -61,13 +60,8 @@ impl AlignmentSpec {
         Self {
             name: name.into(),
             needs_boxes,
-            construct: Box::new(move || Box::new(construct())),
+            for_scene: Box::new(move || Box::new(construct())),
         }
-    }
-
-    /// The method at the beginning of a scene.
-    pub fn for_scene(&self) -> Box<dyn AlignmentMethod> {
-        (self.construct)()
     }
 }
 
@@ -117,14 +111,7 @@ pub enum AlignError {
     /// The detector reported an error.
     #[error(transparent)]
     Detector(#[from] perception::detector::DetectorError),
-    /// A recording without true poses.
-    #[error("{scenario}, {stem}: agent {cav} has no true pose to compare with")]
-    NoTruth {
-        /// The scenario.
-        scenario: String,
-        /// Stem of the frame's file.
-        stem: String,
-        /// Agent without a true pose.
-        cav: protocol::CavId,
-    },
+    /// A recording without true poses: its scenario, the stem of the frame's file, and the agent without a true pose.
+    #[error("{0} has no true pose to compare with")]
+    NoTruth(String),
 }

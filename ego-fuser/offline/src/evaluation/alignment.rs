@@ -62,7 +62,7 @@ pub fn run(
     on_outcome: &mut dyn FnMut(PairOutcome),
 ) -> Result<LeftOut, AlignError> {
     let mut left_out = LeftOut::default();
-    let mut methods: Vec<_> = specs.iter().map(AlignmentSpec::for_scene).collect();
+    let mut methods: Vec<_> = specs.iter().map(|spec| (spec.for_scene)()).collect();
     let needs_boxes = specs.iter().any(|spec| spec.needs_boxes);
     for tick in ticks {
         let agents = scenario.present_agents(tick);
@@ -74,10 +74,9 @@ pub fn run(
         let frames: Vec<Frame> = loaded.frames.into_iter().map(|(_, frame)| frame).collect();
         let truth = frames.iter().map(|frame| {
             let pose = frame.world_from_lidar.map(|pose| pose.isometry());
-            pose.ok_or_else(|| AlignError::NoTruth {
-                scenario: scenario.name.clone(),
-                stem: scenario.ticks[tick].stem.clone(),
-                cav: frame.cav.clone(),
+            pose.ok_or_else(|| {
+                let (scenario, stem) = (&scenario.name, &scenario.ticks[tick].stem);
+                AlignError::NoTruth(format!("{scenario}, {stem}: agent {}", frame.cav))
             })
         });
         let truth = truth.collect::<Result<Vec<_>, _>>()?;

@@ -44,17 +44,10 @@ pub enum EvaluateError {
     /// Vehicles in processes of their own do not answer.
     #[error(transparent)]
     Remote(#[from] Box<RemoteError>),
-    /// The compute time of a process exceeds the period of the scene.
+    /// The compute time of a process exceeds the period of the scene: the process or step that takes too long, and both
+    /// times.
     #[error(
-        "{what} takes {takes_ms:.0} ms, but the scene has a frame every {period_ms:.0} ms: set a smaller time in \
-         `compute` (without one the times are measured on this machine)"
+        "{0}: set a smaller time in `compute` (without one the times are measured on this machine)"
     )]
-    TooSlow {
-        /// Process or step that takes too long.
-        what: &'static str,
-        /// Its compute time, milliseconds.
-        takes_ms: f64,
-        /// Period of frames, milliseconds.
-        period_ms: f64,
-    },
+    TooSlow(String),
 }

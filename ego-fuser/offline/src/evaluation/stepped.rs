@@ -359,12 +359,8 @@ impl<'a> SteppedRun<'a> {
                 Output::Publish { result, tracks, .. } => Ok((*result, tracks)),
                 Output::Failed { error, .. } if error.is_of_frame() => Err(error.to_string()),
                 Output::Failed { error, .. } => return Err(error.into()),
-                Output::Received(source) => {
-                    self.delivery.received(&source);
-                    continue;
-                }
-                Output::Dropped(source, reason) => {
-                    self.delivery.dropped(&source, reason);
+                Output::Counted(source, reason) => {
+                    self.delivery.count(&source, reason);
                     continue;
                 }
                 // The sweeps of simulation time are all computed.

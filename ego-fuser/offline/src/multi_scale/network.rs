@@ -54,8 +54,10 @@ pub struct MultiScaleConfig {
 pub struct MultiScaleNetwork {
     /// Every variable, by the names of the weights file.
     pub variables: VarStore,
-    config: MultiScaleConfig,
-    network: PointPillars,
+    /// Its configuration besides the detector.
+    pub config: MultiScaleConfig,
+    /// The detector.
+    pub network: PointPillars,
     communication: Option<SparseCommunication>,
 }
 
@@ -109,16 +111,6 @@ impl MultiScaleNetwork {
         let model = Self::new(&detector, &weights.metadata_json(FUSION_KEY)?, device)?;
         weights.copy_into(&model.variables)?;
         Ok(model)
-    }
-
-    /// The detector.
-    pub fn network(&self) -> &PointPillars {
-        &self.network
-    }
-
-    /// Its configuration besides the detector.
-    pub fn config(&self) -> &MultiScaleConfig {
-        &self.config
     }
 
     /// From the pillars of all agents to scores and offsets of every sample.

@@ -36,7 +36,7 @@ impl OfflineDetector {
     /// [`ModelError`] names the file and what does not fit.
     pub fn load(path: &Path) -> Result<Self, ModelError> {
         let network = MultiScaleNetwork::load(path, Device::Cpu)?;
-        let config = &network.network().config;
+        let config = &network.network.config;
         Ok(Self {
             crop: Crop::for_detector(config),
             voxeliser: Voxeliser::for_detector(config),
@@ -48,7 +48,7 @@ impl OfflineDetector {
 
     /// Configuration of its encoder and head.
     pub fn config(&self) -> &DetectorConfig {
-        &self.network.network().config
+        &self.network.network.config
     }
 
     /// Detections in the frame of the first vehicle, and the bytes that each of the others that took part had to send:
@@ -81,7 +81,7 @@ impl OfflineDetector {
     fn pillars(&mut self, cloud: &PointCloud, ego_from_cav: &Pose) -> Pillars {
         // A vehicle's own body is where its sensor is: removed before its cloud is moved.
         let cloud = self.crop.without_own_body(cloud);
-        let cloud = match self.network.config().one_frame {
+        let cloud = match self.network.config.one_frame {
             true => merge_points([&cloud], &[*ego_from_cav]),
             false => cloud,
         };
@@ -96,7 +96,7 @@ impl OfflineDetector {
     }
 
     fn is_mirrored(&self) -> bool {
-        self.network.network().config.y_axis == YAxis::Right
+        self.network.network.config.y_axis == YAxis::Right
     }
 
     fn boxes(
@@ -104,11 +104,11 @@ impl OfflineDetector {
         sweeps: &[Pillars],
         poses: &[Pose],
     ) -> Result<(Vec<Detection>, Vec<u64>), ModelError> {
-        let network = self.network.network();
+        let network = &self.network.network;
         let batch = PillarBatch::new(&sweeps.iter().collect::<Vec<_>>(), &network.pillar_grid);
         let mirrored: Vec<Pose> = poses.iter().map(Pose::mirrored_y).collect();
         let poses = if self.is_mirrored() { &mirrored } else { poses };
-        let placement = if self.network.config().one_frame {
+        let placement = if self.network.config.one_frame {
             MapAlignment {
                 agents: poses.len() as i64,
                 theta: None,

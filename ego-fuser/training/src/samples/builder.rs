@@ -78,11 +78,11 @@ impl SampleConfig {
     }
 }
 
-/// Form of the views of a sample.
+/// Form of the views of a sample, or of all samples of a batch.
 #[derive(Debug)]
-pub enum SampleViews {
+pub enum Views<P> {
     /// Pillars, to be encoded.
-    Pillars(Vec<Pillars>),
+    Pillars(P),
     /// `[N, C, H, W]` maps of a frozen encoder.
     Maps(Tensor),
 }
@@ -91,7 +91,7 @@ pub enum SampleViews {
 #[derive(Debug)]
 pub struct Sample {
     /// Every view, the ego's newest first, then the neighbours' newest, then older ones.
-    pub views: SampleViews,
+    pub views: Views<Vec<Pillars>>,
     /// Metadata of every view, the ego's pose being the identity.
     pub facts: Vec<MapMetadata>,
     /// Error that was added to each view's pose.
@@ -185,11 +185,9 @@ impl SampleBuilder {
                 let maps = entries
                     .iter()
                     .map(|entry| maps.map(tick.scenario, scenario, entry.agent, entry.tick));
-                SampleViews::Maps(Tensor::f_cat(&maps.collect::<Result<Vec<_>>>()?, 0)?)
+                Views::Maps(Tensor::f_cat(&maps.collect::<Result<Vec<_>>>()?, 0)?)
             }
-            None => {
-                SampleViews::Pillars(self.pillars(tick.scenario, &entries, &changes, &mut facts)?)
-            }
+            None => Views::Pillars(self.pillars(tick.scenario, &entries, &changes, &mut facts)?),
         };
         Ok(Sample {
             views,

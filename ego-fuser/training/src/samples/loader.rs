@@ -8,7 +8,7 @@ use rand::seq::SliceRandom;
 use rand_chacha::ChaCha8Rng;
 use tch::Tensor;
 
-use super::builder::{Sample, SampleBuilder, SampleViews};
+use super::builder::{Sample, SampleBuilder, Views};
 use super::poses::PoseOffset;
 use super::scenes::TickRef;
 use crate::Error;
@@ -16,20 +16,11 @@ use fusion::MapMetadata;
 use fusion::model::{CooperativeModel, CooperativeOutput, ModelError};
 use fusion::targets::Labels;
 
-/// The views of all samples of a batch.
-#[derive(Debug)]
-pub enum BatchViews {
-    /// Pillars, to be encoded.
-    Pillars(PillarBatch),
-    /// `[sum of views, C, H, W]` maps of a frozen encoder.
-    Maps(Tensor),
-}
-
 /// Samples of one training step.
 #[derive(Debug)]
 pub struct Batch {
     /// All views of all samples.
-    pub views: BatchViews,
+    pub views: Views<PillarBatch>,
     /// Metadata of the views of each sample, ego first.
     pub facts: Vec<Vec<MapMetadata>>,
     /// Errors that were added to the poses of the views of each sample.
@@ -49,13 +40,13 @@ impl Batch {
         let (mut pillars, mut maps) = (Vec::new(), Vec::new());
         for sample in &samples {
             match &sample.views {
-                SampleViews::Pillars(of_sample) => pillars.extend(of_sample),
-                SampleViews::Maps(of_sample) => maps.push(of_sample),
+                Views::Pillars(of_sample) => pillars.extend(of_sample),
+                Views::Maps(of_sample) => maps.push(of_sample),
             }
         }
         let views = match maps[..] {
-            [] => BatchViews::Pillars(PillarBatch::new(&pillars, pillar_grid)),
-            _ => BatchViews::Maps(Tensor::f_cat(&maps, 0)?),
+            [] => Views::Pillars(PillarBatch::new(&pillars, pillar_grid)),
+            _ => Views::Maps(Tensor::f_cat(&maps, 0)?),
         };
         let samples = samples.into_iter();
         let parts = samples.map(|of| (of.facts, of.offsets, of.labels, of.truth));
@@ -79,10 +70,10 @@ impl Batch {
         train: bool,
     ) -> Result<CooperativeOutput, ModelError> {
         match &self.views {
-            BatchViews::Pillars(pillars) => {
+            Views::Pillars(pillars) => {
                 model.forward(&pillars.to_device(model.device()), &self.facts, train)
             }
-            BatchViews::Maps(maps) => {
+            Views::Maps(maps) => {
                 let maps = maps.f_to_device(model.device())?;
                 let maps = model.network().through_compressor(&maps, train);
                 model.fuse_and_detect(&maps, &self.facts, train)

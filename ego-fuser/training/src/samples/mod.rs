@@ -13,8 +13,8 @@ mod refined_boxes;
 mod scenes;
 
 pub use augment::{Augmentation, ViewAugment};
-pub use builder::{Sample, SampleBuilder, SampleConfig, SampleKind, SampleViews};
-pub use loader::{Batch, BatchViews, batches};
+pub use builder::{Sample, SampleBuilder, SampleConfig, SampleKind, Views};
+pub use loader::{Batch, batches};
 pub use moments::Moments;
 pub(crate) use neighbour_boxes::augmentation_summary as box_augmentation;
 pub use poses::{PoseOffset, SamplePoses};

@@ -11,7 +11,8 @@ use protocol::{Box3d, Detection, Pose};
 use rand::Rng;
 use tch::Tensor;
 
-use super::loader::{Batch, BatchViews};
+use super::builder::Views;
+use super::loader::Batch;
 use super::refined_boxes::refined_boxes;
 use crate::Error;
 
@@ -60,7 +61,7 @@ impl Batch {
         model: &CooperativeModel,
         mut rng: Option<&mut impl Rng>,
     ) -> Result<(Vec<SampleWithBoxes>, Vec<Tensor>), Error> {
-        let BatchViews::Maps(maps) = &self.views else {
+        let Views::Maps(maps) = &self.views else {
             return Err(Error::NothingToFreeze);
         };
         let maps = maps.f_to_device(model.device())?;

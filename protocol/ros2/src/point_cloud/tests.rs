@@ -91,7 +91,7 @@ impl Cloud {
         bytes
     }
 
-    fn read(&self) -> Result<RosSweep, PointCloudError> {
+    fn read(&self) -> Result<RosSweep, ReadError> {
         read_point_cloud(&self.bytes::<LittleEndian>([0, 1, 0, 0]), &LIMITS)
     }
 }
@@ -327,7 +327,7 @@ fn a_wrong_message_is_named_with_field_and_values() {
         assert!(
             matches!(
                 read_point_cloud(bytes, &LIMITS),
-                Err(PointCloudError::Message(ReadError::Encoding(_)))
+                Err(ReadError::Encoding(_))
             ),
             "{bytes:?}"
         );

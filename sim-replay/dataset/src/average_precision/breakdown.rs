@@ -28,16 +28,6 @@ pub(super) struct PartMembers {
     pub(super) detections: Vec<bool>,
 }
 
-impl PartMembers {
-    /// All objects and detections.
-    pub(super) fn all(detections: usize, objects: usize) -> Self {
-        Self {
-            objects: vec![true; objects],
-            detections: vec![true; detections],
-        }
-    }
-}
-
 impl Breakdown {
     /// All bins and classes.
     pub(super) fn parts() -> impl Iterator<Item = Self> {

@@ -27,43 +27,27 @@ pub(super) struct ScoredCandidate {
 }
 
 impl FrameOverlaps {
-    /// Overlaps of the detections whose corners all lie in the range.
+    /// Overlaps of the detections whose corners all lie in the range, by falling score. The sort is stable: equal scores
+    /// stay in the order of the detector.
     pub(super) fn new(detections: &[Detection], truth: &GroundTruth) -> Self {
         let within = detections
             .iter()
             .enumerate()
             .filter(|(_, found)| corners_within(&found.box3d.corners(), truth.area_m));
-        let found = within.map(|(index, found)| (index, found.score, footprint(&found.box3d)));
         let (objects, ignored) = (footprints(&truth.objects), footprints(&truth.ignored));
-        Self::of(detections.len(), found, &objects, &ignored)
-    }
-
-    /// Overlaps of footprints that all count.
-    pub(super) fn of_footprints(detections: &[(Polygon, f32)], objects: &[Polygon]) -> Self {
-        let found = detections
-            .iter()
-            .enumerate()
-            .map(|(index, (found, score))| (index, *score, *found));
-        Self::of(detections.len(), found, objects, &[])
-    }
-
-    /// By falling score. The sort is stable: equal scores stay in the order of the detector.
-    fn of(
-        detections: usize,
-        found: impl Iterator<Item = (usize, f32, Polygon)>,
-        objects: &[Polygon],
-        ignored: &[Polygon],
-    ) -> Self {
-        let candidates = found.map(|(index, score, found)| ScoredCandidate {
-            index,
-            score,
-            overlaps: overlaps(&found, objects).collect(),
-            ignored_overlap: overlaps(&found, ignored).fold(0.0, f32::max),
+        let candidates = within.map(|(index, found)| {
+            let footprint = footprint(&found.box3d);
+            ScoredCandidate {
+                index,
+                score: found.score,
+                overlaps: overlaps(&footprint, &objects).collect(),
+                ignored_overlap: overlaps(&footprint, &ignored).fold(0.0, f32::max),
+            }
         });
         let mut by_score: Vec<ScoredCandidate> = candidates.collect();
         by_score.sort_by(|a, b| b.score.total_cmp(&a.score));
         Self {
-            detections,
+            detections: detections.len(),
             by_score,
         }
     }

@@ -118,15 +118,10 @@ fn shift(clouds: &[u64], rows: &[u64]) -> Option<String> {
 /// One row per cloud, in order. `have` says how many clouds have the key of a pose.
 fn by_order(count: usize, clouds: &Keys, poses: &PoseFile, have: &str) -> Result<Join, String> {
     let rows = poses.poses.len();
-    let (cloud, row) = (clouds.shown(), poses.keys.first().map(Keys::shown));
-    let keys = match row {
-        Some(row) => format!("clouds have {cloud}, poses {row}"),
-        None => format!("clouds have {cloud}, poses no key"),
-    };
+    let row = poses.keys.first().map_or("no key".to_owned(), Keys::shown);
+    let keys = format!("clouds have {}, poses {row}", clouds.shown());
     // The order is the weakest key: each check below excludes a contradiction.
-    if let Keys::Names(_) = clouds
-        && !clouds.have_one_form()
-    {
+    if !clouds.have_one_form() {
         return Err(format!(
             "the order of the clouds is not known, since their names are no numbers; {keys}"
         ));

@@ -3,7 +3,6 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use nalgebra::Matrix4;
 use protocol::Pose;
 
 use super::columns::{Columns, PoseColumns, TimeColumns, quaternion_order};
@@ -218,13 +217,8 @@ impl<'a> FileRow<'a> {
             }
             PoseColumns::Matrix(first) => {
                 let values = (*first..columns.width).map(|column| self.number(column));
-                let mut values = values.collect::<Result<Vec<f64>, String>>()?;
-                // Three or four rows of four.
-                if values.len() == 12 {
-                    values.extend([0.0, 0.0, 0.0, 1.0]);
-                }
-                let matrix = Matrix4::from_row_slice(&values);
-                Pose::from_matrix(&matrix).map_err(|error| error.to_string())
+                let values = values.collect::<Result<Vec<f64>, String>>()?;
+                poses::of_rows(&values).map_err(|error| error.to_string())
             }
         }
     }

@@ -7,7 +7,7 @@ use std::path::Path;
 use crate::faults::Faults;
 use crate::json::JsonField;
 use crate::time_stamps::Unit;
-use crate::{Layout, ReadError, Result, Tick, json_table};
+use crate::{ReadError, Result, Tick, json_table};
 use support::statistics;
 
 /// The pairs, below the root.
@@ -32,13 +32,6 @@ pub(super) enum Kind {
 }
 
 impl Kind {
-    pub(super) fn layout(self) -> Layout {
-        match self {
-            Self::Dair => Layout::DAIR,
-            Self::V2xSeq => Layout::V2XSEQ,
-        }
-    }
-
     /// Term for the frames of one drive, and the key of its id.
     fn group(self) -> (&'static str, &'static str) {
         match self {
@@ -270,9 +263,6 @@ fn frame_and_group(entry: &JsonField<'_>, kind: Kind) -> Result<(String, Option<
 
 /// `{delta_x, delta_y}` in metres. A missing one or an empty text is 0.
 pub(super) fn offset_m(offset: &JsonField<'_>) -> Result<[f64; 2]> {
-    let [x, y] = ["delta_x", "delta_y"].map(|key| {
-        let delta = offset.optional(key)?;
-        delta.map_or(Ok(0.0), |delta| delta.number())
-    });
-    Ok([x?, y?])
+    let [x, y] = ["delta_x", "delta_y"].map(|key| offset.optional_of(key, JsonField::number));
+    Ok([x?.unwrap_or(0.0), y?.unwrap_or(0.0)])
 }

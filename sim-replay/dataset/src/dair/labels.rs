@@ -8,7 +8,7 @@ use protocol::Pose;
 use crate::frame::{Object, ObjectClass};
 use crate::ground_truth::upright_box;
 use crate::json::{self, JsonField};
-use crate::poses::box_angle_rad;
+use crate::poses::{self, box_angle_rad};
 use crate::{Problem, ReadError, Result, classes, repeats};
 use protocol::rotated_iou::Polygon;
 
@@ -68,12 +68,10 @@ pub(super) fn in_frame(
         let rotation = label.required("rotation")?;
         let yaw_rad = box_angle_rad(rotation.number()?).map_err(|reason| rotation.error(reason))?;
         let yaw = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), yaw_rad);
-        let world_from_object: Pose =
-            (world_from_lidar * Isometry3::from_parts(center, yaw)).into();
-        let valid = world_from_object.validate();
-        valid.map_err(|error| location.error(error.to_string()))?;
+        let pose = poses::valid(world_from_lidar * Isometry3::from_parts(center, yaw));
+        let pose = pose.map_err(|error| location.error(error.to_string()))?;
         let number = track(label).unwrap_or(number);
-        Ok(Some((number, world_from_object, size_m)))
+        Ok(Some((number, pose, size_m)))
     })
 }
 
@@ -170,9 +168,8 @@ fn from_corners(field: &JsonField<'_>) -> Result<Option<(Pose, [f64; 3])>> {
     let rotation = Rotation3::from_matrix_unchecked(Matrix3::from_columns(&[x, y, x.cross(&y)]));
     let center = corners.into_iter().sum::<Vector3<f64>>() / 8.0;
     let rotation = UnitQuaternion::from_rotation_matrix(&rotation);
-    let pose: Pose = Isometry3::from_parts(center.into(), rotation).into();
-    let valid = pose.validate();
-    valid.map_err(|error| field.error(error.to_string()))?;
+    let pose = poses::valid(Isometry3::from_parts(center.into(), rotation));
+    let pose = pose.map_err(|error| field.error(error.to_string()))?;
     Ok(Some((pose, size_m)))
 }
 

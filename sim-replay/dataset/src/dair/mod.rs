@@ -28,8 +28,8 @@ use self::labels::{LabelList, LabelledObjects};
 use super::layout::{LayoutReader, LayoutRow, opened};
 use super::points::{SweepStorage, Sweeps};
 use super::{
-    Dataset, FrameSource, MissingFrame, OpenOptions, Problem, ReadError, Result, Scenario, Tick,
-    files, roots,
+    Dataset, FrameSource, Layout, MissingFrame, OpenOptions, Problem, ReadError, Result, Scenario,
+    Tick, files, roots,
 };
 use crate::frame::{Frame, Object};
 use crate::pcd::PcdCloud;
@@ -144,7 +144,10 @@ fn scenario(
             .filter_map(|tick| Some(sides.points(kept.get(&tick.stem)?, PairSide::of(agent))));
         sweeps = sweeps.with_agent(agent.clone(), files);
     }
-    let layout = sides.kind.layout();
+    let layout = match sides.kind {
+        Kind::Dair => Layout::DAIR,
+        Kind::V2xSeq => Layout::V2XSEQ,
+    };
     let source = Arc::new(DairSource {
         sides,
         pairs: kept,

@@ -6,10 +6,10 @@ use serde_json::{Value, json};
 
 use super::labels::LabelList;
 use super::*;
+use crate::LoadOptions;
 use crate::frame::ObjectClass;
-use crate::ground_truth::{GroundTruthRule, merge};
+use crate::ground_truth::{GroundTruthRule, merged_objects};
 use crate::pcd::{self, Encoding, IntensityField};
-use crate::{Layout, LoadOptions};
 
 const T0_MICROS: u64 = 1_626_155_000_000_000;
 const RULE: GroundTruthRule = GroundTruthRule {
@@ -274,13 +274,13 @@ fn cooperative_labels_are_the_ground_truth_of_a_pair() {
     let set = DataSet::new(Kind::Dair);
     let frames = frames(&set.open().scenarios[0], 0);
     for present in [frames.iter().collect::<Vec<_>>(), vec![&frames[0]]] {
-        let merged = merge(&present, 0, &RULE);
-        let [(id, van)] = &merged[..] else {
+        let merged = merged_objects(&present, 0, &RULE);
+        let [(object, van)] = &merged[..] else {
             panic!("{merged:?}")
         };
         // 30 m ahead of the LiDAR, 0.8 m below it.
         assert!(
-            *id == 0
+            object.id == 0
                 && close(van.center_m, [30.0, 0.0, -0.8])
                 && close(van.size_m, [4.0, 2.0, 1.5]),
             "{van:?}"
@@ -317,12 +317,12 @@ fn without_cooperative_labels_both_sides_count_and_common_objects_once() {
         "the frame is still read"
     );
     let (unit, _) = set.problems_of(1);
-    let merged = merge(&[&vehicle, &unit], 0, &RULE);
+    let merged = merged_objects(&[&vehicle, &unit], 0, &RULE);
     let [(car, car_box), (truck, truck_box)] = &merged[..] else {
         panic!("{merged:?}")
     };
     assert_eq!(
-        (*car, *truck),
+        (car.id, truck.id),
         (LabelList::Vehicle.id(0), LabelList::Infrastructure.id(1))
     );
     assert!(close(car_box.center_m, [10.0, 1.0, -1.0]) && (car_box.heading_rad - 0.1).abs() < 1e-9);
@@ -331,7 +331,7 @@ fn without_cooperative_labels_both_sides_count_and_common_objects_once() {
         close(truck_box.center_m, [-0.5, -41.5, 0.2]),
         "{truck_box:?}"
     );
-    let seen_by_unit = merge(&[&unit], 0, &RULE);
+    let seen_by_unit = merged_objects(&[&unit], 0, &RULE);
     assert!(
         close(seen_by_unit[0].1.center_m, [-32.5, 10.5, -3.2]),
         "{seen_by_unit:?}"
@@ -380,13 +380,13 @@ fn sequences_have_track_ids_and_their_offset_in_the_frame_of_the_vehicle() {
         frames[1].world_from_lidar.unwrap().translation_m,
         [130.5, 201.5, 24.0]
     ));
-    let merged = merge(&frames.iter().collect::<Vec<_>>(), 0, &RULE);
-    let [(id, car)] = &merged[..] else {
+    let frames_of_tick: Vec<&Frame> = frames.iter().collect();
+    let merged = merged_objects(&frames_of_tick, 0, &RULE);
+    let [(object, car)] = &merged[..] else {
         panic!("cyclists are no vehicles: {merged:?}")
     };
-    assert!(
-        *id == 4242 && close(car.center_m, [30.0, 0.0, -0.8]) && close(car.size_m, [4.4, 1.9, 1.5])
-    );
+    assert_eq!(object.id, 4242);
+    assert!(close(car.center_m, [30.0, 0.0, -0.8]) && close(car.size_m, [4.4, 1.9, 1.5]));
     assert_eq!(
         frames[0].cooperative_objects.as_ref().unwrap()[1].class,
         ObjectClass::TwoWheeler
@@ -537,12 +537,10 @@ fn either_order_of_corners_is_the_same_box() {
             .unwrap()
             .swap(a, b);
     }
-    set.write(
-        "cooperative/label_world/000010.json",
-        &json!([mirrored, world_label()]),
-    );
-    let objects = set.problems_of(0).0.cooperative_objects.unwrap();
-    let [a, b] = [0, 1].map(|index: usize| objects[index].world_from_object);
+    let [a, b] = [mirrored, world_label()].map(|label| {
+        set.write("cooperative/label_world/000010.json", &json!([label]));
+        set.problems_of(0).0.cooperative_objects.unwrap()[0].world_from_object
+    });
     assert!(close(a.translation_m, b.translation_m) && (a.yaw_rad() - b.yaw_rad()).abs() < 1e-9);
     assert!((a.yaw_rad().to_degrees() - 90.0).abs() < 1e-9);
 }

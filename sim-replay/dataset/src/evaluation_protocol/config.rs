@@ -18,7 +18,6 @@ pub struct ProtocolConfig {
     /// Protocol of a benchmark: opv2v, v2xset, v2vdet, v2xr, v2v4real, dair, v2xseq, v2xreal, v2xreal-v2v, v2xreal-i2i,
     /// v2xsim, v2xradar, rcooper or mars [default: the one of the data set's layout].
     #[arg(long = "protocol", value_name = "NAME")]
-    #[serde(rename = "preset")]
     pub preset: Option<String>,
     /// Agents farther from the ego than this do not take part, metres in the plane.
     #[arg(long = "comm-range-m", value_name = "M")]
@@ -60,17 +59,17 @@ impl ProtocolConfig {
             format!("unknown protocol {name:?}; there are {}", known.join(", "))
         })?;
         let rule = &mut protocol.ground_truth;
-        rule.comm_range_m =
-            checked("comm_range_m", self.comm_range_m, 0.0..=1e5)?.unwrap_or(rule.comm_range_m);
-        rule.min_corners =
-            checked("min_corners", self.min_corners, 1..=8)?.unwrap_or(rule.min_corners);
+        let comm_range_m = self.comm_range_m.unwrap_or(rule.comm_range_m);
+        rule.comm_range_m = checked("comm_range_m", comm_range_m, 0.0..=1e5)?;
+        let min_corners = self.min_corners.unwrap_or(rule.min_corners);
+        rule.min_corners = checked("min_corners", min_corners, 1..=8)?;
         rule.classes = self.classes.unwrap_or(rule.classes);
         if let Some(range) = &self.ground_truth_range_m {
             [rule.x_m, rule.y_m, rule.z_m] = intervals("ground_truth_range_m", range)?;
             protocol.exact_range = true;
         }
-        protocol.max_agents =
-            checked("max_agents", self.max_agents, 1..=1000)?.unwrap_or(protocol.max_agents);
+        let max_agents = self.max_agents.unwrap_or(protocol.max_agents);
+        protocol.max_agents = checked("max_agents", max_agents, 1..=1000)?;
         protocol.agents = self.agent_kinds.unwrap_or(protocol.agents);
         protocol.ego = self.ego_kind.unwrap_or(protocol.ego);
         protocol.ap_order = self.ap_order.unwrap_or(protocol.ap_order);
@@ -81,16 +80,14 @@ impl ProtocolConfig {
 /// An error if the value is outside `range`.
 fn checked<T: PartialOrd + fmt::Display>(
     name: &str,
-    value: Option<T>,
+    value: T,
     range: RangeInclusive<T>,
-) -> Result<Option<T>, String> {
-    match value {
-        Some(value) if !range.contains(&value) => {
-            let (low, high) = (range.start(), range.end());
-            Err(format!("{name}: {value}, expected {low} to {high}"))
-        }
-        value => Ok(value),
+) -> Result<T, String> {
+    if range.contains(&value) {
+        return Ok(value);
     }
+    let (low, high) = (range.start(), range.end());
+    Err(format!("{name}: {value}, expected {low} to {high}"))
 }
 
 /// Low and high of x, y and z, metres, from x, y, z low, then x, y, z high, the value of the option `name`.

@@ -38,7 +38,7 @@ pub(super) fn without_ground_truth(
     let targets = objects.filter(|object| rule.classes.contains(object.class));
     let (targets, read, all) = (targets.count(), ticks.len(), scenario.ticks.len());
     let is_found = |frames: &Vec<&Frame>| {
-        (0..frames.len()).any(|ego| !ground_truth::merge(frames, ego, rule).is_empty())
+        (0..frames.len()).any(|ego| !ground_truth::merged_objects(frames, ego, rule).is_empty())
     };
     // A few objects of some of the ticks may well be out of range.
     if targets <= ENOUGH_BOXES * usize::from(read < all)

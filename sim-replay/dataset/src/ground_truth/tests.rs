@@ -29,9 +29,9 @@ fn truck(id: i64, x: f64) -> Object {
 }
 
 fn ids(frames: &[Frame], ego: usize, rule: &GroundTruthRule) -> Vec<i64> {
-    merge(&frames.iter().collect::<Vec<_>>(), ego, rule)
+    merged_objects(&frames.iter().collect::<Vec<_>>(), ego, rule)
         .into_iter()
-        .map(|(id, _)| id)
+        .map(|(object, _)| object.id)
         .collect()
 }
 
@@ -43,7 +43,7 @@ fn annotations_merge_by_id_and_the_ego_stays() {
     ];
     assert_eq!(ids(&frames, 0, &GroundTruthRule::OPV2V), [7, 1]);
     assert_eq!(ids(&frames[..1], 0, &GroundTruthRule::OPV2V), [7]);
-    let seen_by_two = merge(&[&frames[0], &frames[1]], 1, &GroundTruthRule::OPV2V);
+    let seen_by_two = merged_objects(&[&frames[0], &frames[1]], 1, &GroundTruthRule::OPV2V);
     assert_eq!(seen_by_two[0].1.center_m, [-30.0, 0.0, -1.0]);
 }
 

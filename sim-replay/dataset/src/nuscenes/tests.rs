@@ -6,7 +6,7 @@ use serde_json::{Value, json};
 
 use super::*;
 use crate::LoadOptions;
-use crate::ground_truth::{GroundTruthRule, merge};
+use crate::ground_truth::{GroundTruthRule, merged_objects};
 use crate::pcd::{Encoding, IntensityField, encode};
 use crate::points::tests::turn;
 
@@ -420,8 +420,9 @@ fn agents_list_what_their_sweeps_hit_but_not_themselves() {
         "narrower than 1.5 m"
     );
     assert!(listed(&frames[2]).is_empty());
-    let merged = merge(&frames.iter().collect::<Vec<_>>(), 0, &RULE);
-    let [(0, car)] = &merged[..] else {
+    let frames: Vec<&Frame> = frames.iter().collect();
+    let merged = merged_objects(&frames, 0, &RULE);
+    let [(Object { id: 0, .. }, car)] = &merged[..] else {
         panic!("{merged:?}")
     };
     assert!(
@@ -540,7 +541,7 @@ fn nuscenes_is_turned_so_that_x_points_ahead() {
     let frame = &load(&dataset.scenarios[0], 0)[0];
     assert_eq!(frame.points.xyzi, [[10.0, -1.0, -1.25, 0.5]]);
     assert!(frame.world_from_lidar.unwrap().yaw_rad().abs() < 1e-9);
-    let merged = merge(&[frame], 0, &RULE);
+    let merged = merged_objects(&[frame], 0, &RULE);
     assert!(
         close(merged[0].1.center_m, [10.0, -1.0, -0.5]),
         "{merged:?}"

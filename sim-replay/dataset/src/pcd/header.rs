@@ -91,6 +91,11 @@ impl<'a> HeaderEntry<'a> {
         PcdError::at(self.line, self.key, reason)
     }
 
+    /// The value of a field; as many as there are fields.
+    fn of_field(&self, index: usize) -> &'a str {
+        self.values.get(index).copied().unwrap_or_default()
+    }
+
     /// The only value.
     fn single(&self) -> Result<&'a str, PcdError> {
         match self.values[..] {
@@ -115,7 +120,7 @@ impl PcdHeader {
         // The byte order mark of UTF-8 would be part of the first key.
         let mut rest = bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes);
         let mut line = 0;
-        while !entries.has("DATA") {
+        while entries.find("DATA").is_none() {
             line += 1;
             let Some(end) = rest.iter().take(MAX_LINE).position(|&byte| byte == b'\n') else {
                 let reason = "the header ends before a DATA line";
@@ -179,26 +184,20 @@ impl PcdHeader {
     }
 
     /// The fields that are read must be numbers; of all others only the size is needed.
-    #[expect(
-        clippy::indexing_slicing,
-        reason = "indices of the fields, of which each has one type"
-    )]
     fn check_formats(&self, entries: &Entries<'_>) -> Result<(), PcdError> {
         let intensity = match self.intensity {
             IntensitySource::Value(index) | IntensitySource::Red(index) => Some(index),
             IntensitySource::None => None,
         };
-        for index in self.xyz.into_iter().chain(intensity) {
-            let PcdField {
-                name, kind, size, ..
-            } = &self.fields[index];
+        let read = self.xyz.into_iter().chain(intensity);
+        let read = read.filter_map(|index| Some((index, self.fields.get(index)?)));
+        for (index, field) in read {
+            let (name, kind, size) = (&field.name, field.kind, field.size);
             let (kinds, sizes) = (entries.get("TYPE")?, entries.get("SIZE")?);
             let allowed: &[usize] = match kind {
                 ScalarKind::Padding => {
-                    let reason = format!(
-                        "{:?} of field {name}, expected F, I or U",
-                        kinds.values[index]
-                    );
+                    let kind = kinds.of_field(index);
+                    let reason = format!("{kind:?} of field {name}, expected F, I or U");
                     return Err(kinds.error(reason));
                 }
                 // Ahead of the types: a packed colour has four bytes, as a float and as an integer.
@@ -206,10 +205,10 @@ impl PcdHeader {
                 ScalarKind::Float => &[4, 8],
                 ScalarKind::Signed | ScalarKind::Unsigned => &[1, 2, 4, 8],
             };
-            if !allowed.contains(size) {
+            if !allowed.contains(&size) {
                 let reason = format!(
                     "{size} of field {name}, expected one of {allowed:?} for TYPE {}",
-                    kinds.values[index]
+                    kinds.of_field(index)
                 );
                 return Err(sizes.error(reason));
             }
@@ -230,10 +229,6 @@ fn without_comment(line: &[u8]) -> &[u8] {
 }
 
 impl<'a> Entries<'a> {
-    fn has(&self, key: &str) -> bool {
-        self.find(key).is_some()
-    }
-
     fn add(&mut self, line: u64, text: &'a [u8]) -> Result<(), PcdError> {
         let text = std::str::from_utf8(text)
             .map_err(|_| fault(line, "the header is not text: is this a PCD file?"))?;
@@ -250,7 +245,7 @@ impl<'a> Entries<'a> {
             let word: String = word.chars().take(40).collect();
             return Err(fault(line, format!("{word:?} is no PCD header key")));
         };
-        if self.has(key) {
+        if self.find(key).is_some() {
             return Err(PcdError::at(line, key, "is given a second time"));
         }
         let values = words.collect();
@@ -287,10 +282,6 @@ impl<'a> Entries<'a> {
         }
     }
 
-    #[expect(
-        clippy::indexing_slicing,
-        reason = "as many sizes, types and counts as names"
-    )]
     fn fields(&self) -> Result<Vec<PcdField>, PcdError> {
         let names = self.get("FIELDS")?;
         let fields = names.values.len();
@@ -299,12 +290,12 @@ impl<'a> Entries<'a> {
         }
         let sizes = self.per_field("SIZE", fields)?;
         let kinds = self.per_field("TYPE", fields)?;
-        let counts = self.has("COUNT").then(|| self.per_field("COUNT", fields));
+        let counts = self.find("COUNT").map(|_| self.per_field("COUNT", fields));
         let counts = counts.transpose()?;
         let fields = names.values.iter().enumerate().map(|(index, name)| {
             Ok(PcdField {
                 name: (*name).to_owned(),
-                kind: number_kind(kinds.values[index]),
+                kind: number_kind(kinds.of_field(index)),
                 size: number_of(name, sizes, index, 1..=MAX_SIZE)?,
                 count: match counts {
                     Some(counts) => number_of(name, counts, index, 0..=MAX_COUNT)?,
@@ -361,14 +352,13 @@ fn number_kind(kind: &str) -> ScalarKind {
 }
 
 /// The number that a header line gives for a field.
-#[expect(clippy::indexing_slicing, reason = "as many sizes and counts as names")]
 fn number_of(
     name: &str,
     entry: &HeaderEntry<'_>,
     index: usize,
     range: RangeInclusive<usize>,
 ) -> Result<usize, PcdError> {
-    let value = entry.values[index];
+    let value = entry.of_field(index);
     let number = value.parse().ok().filter(|number| range.contains(number));
     number.ok_or_else(|| {
         let (low, high) = (range.start(), range.end());

@@ -24,7 +24,9 @@ pub(super) fn decompress(packed: &[u8], unpacked_len: usize) -> Result<Vec<u8>, 
     while let Some((&control, rest)) = input.split_first() {
         let control = usize::from(control);
         input = if control < 32 {
-            literals(&mut output, rest, control + 1)?
+            let (literals, rest) = rest.split_at_checked(control + 1).ok_or(CUT_OFF)?;
+            output.extend_from_slice(literals);
+            rest
         } else {
             repeat(&mut output, rest, control)?
         };
@@ -38,16 +40,6 @@ pub(super) fn decompress(packed: &[u8], unpacked_len: usize) -> Result<Vec<u8>, 
     }
 }
 
-fn literals<'a>(output: &mut Vec<u8>, input: &'a [u8], count: usize) -> Result<&'a [u8], String> {
-    let (literals, rest) = input.split_at_checked(count).ok_or(CUT_OFF)?;
-    output.extend_from_slice(literals);
-    Ok(rest)
-}
-
-#[expect(
-    clippy::indexing_slicing,
-    reason = "`at` is below the growing length: it begins `distance` before it"
-)]
 fn repeat<'a>(output: &mut Vec<u8>, input: &'a [u8], control: usize) -> Result<&'a [u8], String> {
     let mut next = input.iter();
     let mut count = (control >> 5) + 2;
@@ -60,13 +52,12 @@ fn repeat<'a>(output: &mut Vec<u8>, input: &'a [u8], control: usize) -> Result<&
     let start = len.checked_sub(distance).ok_or_else(|| {
         format!("a block repeats output {distance} bytes back, but only {len} bytes precede it")
     })?;
-    // The repeated range may overlap the output: copied byte by byte, unless it does not.
-    if distance >= count {
-        output.extend_from_within(start..start + count);
-    } else {
-        for at in start..start + count {
-            output.push(output[at]);
-        }
+    // The repeated range may overlap the output: what is there of it is copied until that suffices.
+    let mut left = count;
+    while left > 0 {
+        let copied = left.min(output.len() - start);
+        output.extend_from_within(start..start + copied);
+        left -= copied;
     }
     Ok(next.as_slice())
 }

@@ -56,14 +56,13 @@ impl FloatForm {
         let counts = [Self::Four, Self::Five]
             .map(|form| votes.iter().filter(|vote| **vote == Ok(form)).count());
         match counts {
-            [0, 0] if votes.is_empty() => {
+            [0, 0] => votes.into_iter().next().unwrap_or_else(|| {
                 let fitting = [Self::Four, Self::Five].into_iter().find(|form| {
                     (samples.first())
                         .is_some_and(|bytes| bytes.len().is_multiple_of(4 * form.numbers()))
                 });
                 Ok(fitting.unwrap_or(Self::Four))
-            }
-            [0, 0] => votes.into_iter().next().unwrap_or(Ok(Self::Four)),
+            }),
             [four, five] if five > four => Ok(Self::Five),
             _ => Ok(Self::Four),
         }

@@ -102,6 +102,7 @@ impl JoinAttempt {
             poses.collect::<SweepPoses>()
         });
         let all: Vec<SweepPoses> = all.collect();
+        let found = |poses: &SweepPoses| poses.iter().filter(|pose| pose.is_ok()).count();
         let counts: Vec<usize> = all.iter().map(found).collect();
         let most = counts.iter().copied().max().unwrap_or(0);
         let suited = sources.sources.iter().zip(&counts).enumerate();
@@ -170,10 +171,8 @@ fn text(
     let clouds = (contents.clouds.iter())
         .filter(|(topic, _)| **topic != sweeps.topic)
         .map(|(topic, clouds)| format!("{topic}, {} clouds", clouds.len()));
-    let unused: Vec<String> = match chosen {
-        Some(_) => unused.chain(clouds).collect(),
-        None => unused.collect(),
-    };
+    let clouds = clouds.filter(|_| chosen.is_some());
+    let unused: Vec<String> = unused.chain(clouds).collect();
     let unused = unused.join("; ");
     match chosen {
         Some(chosen) => {
@@ -241,10 +240,6 @@ fn without_pose<'a>(
             let all = poses.len();
             (count > 0).then(|| format!("{topic}: {count} of {all} sweeps {place}: left out"))
         })
-}
-
-fn found(poses: &SweepPoses) -> usize {
-    poses.iter().filter(|pose| pose.is_ok()).count()
 }
 
 fn seconds(nanos: u64) -> f64 {

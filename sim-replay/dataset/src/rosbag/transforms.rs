@@ -64,13 +64,16 @@ impl Transforms {
     pub(super) fn route_down(&self, body: &str, frame: &str) -> Option<FrameRoute> {
         let route = self.route(body, frame)?;
         let mut steps = route.0.iter();
-        let is_held = steps.all(|step| step.is_down || !self.is_moving(*step));
+        let is_held = steps.all(|step| step.is_down || self.moving(step).is_none());
         is_held.then_some(route)
     }
 
-    fn is_moving(&self, step: RouteStep) -> bool {
-        let edge = self.edges.get(step.edge);
-        edge.is_some_and(|edge| matches!(edge.motion, Motion::Moving(_)))
+    /// The trajectory of a step, if it is no fixed transform.
+    fn moving(&self, step: &RouteStep) -> Option<&Trajectory> {
+        match &self.edges.get(step.edge)?.motion {
+            Motion::Moving(poses) => Some(poses),
+            Motion::Fixed(_) => None,
+        }
     }
 
     /// The shortest way from `target` to `source`; `None` if they are not connected.
@@ -118,11 +121,7 @@ impl Transforms {
 
     /// The trajectory along a route that has the fewest poses.
     pub(super) fn sparsest(&self, route: &FrameRoute) -> Option<&Trajectory> {
-        let edges = route.0.iter().filter_map(|step| self.edges.get(step.edge));
-        let moving = edges.filter_map(|edge| match &edge.motion {
-            Motion::Moving(poses) => Some(poses),
-            Motion::Fixed(_) => None,
-        });
+        let moving = route.0.iter().filter_map(|step| self.moving(step));
         moving.min_by_key(|poses| poses.len())
     }
 
@@ -147,7 +146,7 @@ impl Transforms {
 
     fn begins_moving(&self, route: &FrameRoute) -> bool {
         let first = route.0.first();
-        first.is_some_and(|step| step.is_down && self.is_moving(*step))
+        first.is_some_and(|step| step.is_down && self.moving(step).is_some())
     }
 }
 

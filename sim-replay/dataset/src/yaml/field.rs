@@ -7,11 +7,6 @@ use crate::{ReadError, Result};
 pub(crate) type YamlField<'a> = crate::field::Field<'a, YamlNode>;
 
 impl<'a> YamlField<'a> {
-    /// Kind and content in few words, for messages.
-    pub(crate) fn found(&self) -> String {
-        self.node.value.kind()
-    }
-
     /// An error about this field.
     pub(crate) fn error(&self, reason: impl Into<String>) -> ReadError {
         ReadError::malformed_at(self.path, Some(self.node.line), self.place(), reason)
@@ -19,7 +14,7 @@ impl<'a> YamlField<'a> {
 
     /// An error with the found and the expected value.
     pub(crate) fn expected(&self, what: &str) -> ReadError {
-        self.error(format!("{}, expected {what}", self.found()))
+        self.error(format!("{}, expected {what}", self.node.value.kind()))
     }
 
     /// The entries of a map.

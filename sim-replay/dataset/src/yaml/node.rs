@@ -29,7 +29,7 @@ pub(crate) enum Value {
 
 impl Value {
     /// Kind and content in few words, for messages.
-    pub(super) fn kind(&self) -> String {
+    pub(crate) fn kind(&self) -> String {
         match self {
             Self::Null => "nothing".into(),
             Self::Bool(value) => value.to_string(),

@@ -30,11 +30,10 @@ fn number(text: &str) -> Option<Value> {
         ".nan" | ".NaN" | ".NAN" => return Some(Value::Float(f64::NAN)),
         _ => {}
     }
-    if let Some(digits) = text.strip_prefix("0x") {
-        return i64::from_str_radix(digits, 16).map(Value::Integer).ok();
-    }
-    if let Some(digits) = text.strip_prefix("0o") {
-        return i64::from_str_radix(digits, 8).map(Value::Integer).ok();
+    for (prefix, radix) in [("0x", 16), ("0o", 8)] {
+        if let Some(digits) = text.strip_prefix(prefix) {
+            return i64::from_str_radix(digits, radix).map(Value::Integer).ok();
+        }
     }
     // Letters other than the exponent are rejected: Rust would parse `infinity` too. It parses no `1_0`.
     text.bytes()

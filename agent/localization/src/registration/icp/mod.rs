@@ -172,7 +172,8 @@ impl IcpTarget {
 /// A sweep prepared for registration, and the data that a vehicle would have to send of it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct IcpSource {
-    points_m: Vec<Vector3<f64>>,
+    /// The points that are left `[N]`, in the frame of the sensor, metres.
+    pub points_m: Vec<Vector3<f64>>,
 }
 
 impl IcpSource {
@@ -181,11 +182,6 @@ impl IcpSource {
         Self {
             points_m: decimate(within(xyzi, RANGE_M), SOURCE_VOXEL_M),
         }
-    }
-
-    /// The points that are left `[N]`, in the frame of the sensor, metres.
-    pub fn points_m(&self) -> &[Vector3<f64>] {
-        &self.points_m
     }
 }
 

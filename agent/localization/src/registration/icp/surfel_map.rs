@@ -48,7 +48,8 @@ struct Config {
 #[derive(Debug, Clone)]
 pub struct SurfelMap {
     target: IcpTarget,
-    place: String,
+    /// Name of the place, as of its head; empty if it is not known.
+    pub(crate) place: String,
     /// Scale of the covariance of registered poses, if it was fitted.
     pub(crate) covariance_scale: Option<CovarianceScale>,
 }
@@ -97,11 +98,6 @@ impl SurfelMap {
             .levels
             .last()
             .map_or(0.0, |planes| planes.voxel_m)
-    }
-
-    /// Name of the place, as of its head; empty if it is not known.
-    pub fn place(&self) -> &str {
-        &self.place
     }
 
     /// Writes the finest planes of a fitted target of a place; returns the file's SHA-256.
@@ -317,7 +313,7 @@ pub(crate) mod tests {
         // Two hundred metres beside it nothing above the ground has a partner.
         let elsewhere = Isometry3::translation(200.0, 0.0, 0.0) * truth;
         assert!(register(&source, map.target(), &elsewhere, &config).is_err());
-        assert_eq!(map.place(), "yard");
+        assert_eq!(map.place, "yard");
     }
 
     #[test]

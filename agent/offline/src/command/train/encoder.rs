@@ -4,10 +4,12 @@ use std::path::PathBuf;
 
 use agent_offline::TrainingBar;
 use agent_offline::training::{EncoderAccuracy, EncoderSummary, EncoderTrainConfig, train_encoder};
+use anyhow::Context;
 use localization::pgc::SceneEncoderConfig;
 use perception::train::{ModelCard, TrainingOptions};
+use support::cli::BadInput;
 
-use super::options::{bad, check_folders, run_config, with_bar};
+use super::options::with_bar;
 
 /// Train a scene encoder on sweeps that overlap; writes checkpoint, curve.csv, weights.safetensors and model-card.md.
 ///
@@ -52,14 +54,20 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
 impl Args {
     fn config(&self) -> anyhow::Result<EncoderTrainConfig> {
         if self.validate_every_steps == 0 {
-            return Err(bad("--validate-every-steps must be above zero"));
+            return Err(BadInput::new("--validate-every-steps must be above zero").into());
         }
-        check_folders(self.dataset.iter().chain(&self.validation))?;
+        // Before anything is computed.
+        for folder in self.dataset.iter().chain(&self.validation) {
+            std::fs::metadata(folder)
+                .with_context(|| folder.display().to_string())
+                .map_err(BadInput::of)?;
+        }
+        let run = self.options.run_config(self.batch, self.lr);
         Ok(EncoderTrainConfig {
             scenes: self.dataset.clone(),
             validation: self.validation.clone(),
             encoder: self.network.clone(),
-            run: run_config(&self.options, self.batch, self.lr)?,
+            run: run.map_err(BadInput::of)?,
             validate_every: self.validate_every_steps,
         })
     }

@@ -5,10 +5,11 @@ use std::path::PathBuf;
 use agent_offline::training::{PoseRegressionConfig, PoseRegressionSummary};
 use agent_offline::{Error, TrainingBar};
 use perception::train::{ModelCard, Observe, RateSchedule, TrainingOptions};
+use support::cli::BadInput;
 
 use crate::command::scene_heads::check_one_map;
 
-use super::options::{SceneOptions, bad, run_config, with_bar};
+use super::options::{SceneOptions, with_bar};
 
 /// Decoupled weight decay: sweeps are few beside the parameters.
 const WEIGHT_DECAY: f64 = 0.05;
@@ -70,12 +71,12 @@ impl Args {
         let turn_deg = self.turn_deg;
         // A range, so that NaN is refused too.
         if !(0.0..=180.0).contains(&turn_deg) {
-            return Err(bad(&format!(
-                "--turn-deg is {turn_deg}, must be 0 to 180 degrees"
-            )));
+            let reason = format!("--turn-deg is {turn_deg}, must be 0 to 180 degrees");
+            return Err(BadInput::new(reason).into());
         }
         check_one_map(&[&self.sweeps.dataset[..], &self.validation[..]].concat())?;
-        let mut run = run_config(&self.options, self.batch, self.lr)?;
+        let run = self.options.run_config(self.batch, self.lr);
+        let mut run = run.map_err(BadInput::of)?;
         run.optimizer.weight_decay = WEIGHT_DECAY;
         run.optimizer.max_gradient_norm = MAX_GRADIENT_NORM;
         run.schedule = RateSchedule::HeldRate;

@@ -8,10 +8,11 @@ use agent_offline::training::{
     LeaveOut, SceneSummary, SceneTrainConfig, SweepAugmentation, train_scene,
 };
 use perception::train::{ModelCard, TrainingOptions};
+use support::cli::BadInput;
 
 use crate::command::scene_heads::check_one_map;
 
-use super::options::{SceneOptions, bad, run_config, with_bar};
+use super::options::{SceneOptions, with_bar};
 
 /// Train the head of one scene on the features of a frozen encoder; writes checkpoint, curve.csv, weights.safetensors
 /// and model-card.md.
@@ -87,10 +88,11 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
 impl Args {
     fn config(&self) -> anyhow::Result<SceneTrainConfig> {
         if self.copies == 0 || self.validation_sweeps == 0 {
-            return Err(bad("--copies and --validation-sweeps must be above zero"));
+            let reason = "--copies and --validation-sweeps must be above zero";
+            return Err(BadInput::new(reason).into());
         }
         check_one_map(&[&self.sweeps.dataset[..], &self.validation[..]].concat())?;
-        let run = run_config(&self.options, self.batch, self.lr)?;
+        let run = self.options.run_config(self.batch, self.lr);
         Ok(SceneTrainConfig {
             scenes: self.sweeps.dataset.clone(),
             validation: self.validation.clone(),
@@ -109,7 +111,7 @@ impl Args {
                 keep: 0.7,
             },
             redundancy: self.leave_out,
-            run,
+            run: run.map_err(BadInput::of)?,
             validate_every: Duration::from_secs(self.validate_every_s),
         })
     }

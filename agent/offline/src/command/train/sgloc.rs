@@ -5,10 +5,11 @@ use std::path::PathBuf;
 use agent_offline::TrainingBar;
 use agent_offline::training::{SgLocTrainConfig, train_sgloc};
 use perception::train::{ModelCard, TrainingOptions};
+use support::cli::BadInput;
 
 use crate::command::scene_heads::check_one_map;
 
-use super::options::{SceneOptions, run_config, with_bar};
+use super::options::{SceneOptions, with_bar};
 
 /// Train SGLoc's head on one scene, on a frozen encoder; writes checkpoint, weights.safetensors and model-card.md.
 #[derive(Debug, clap::Args)]
@@ -30,11 +31,12 @@ pub(crate) struct Args {
 
 pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     check_one_map(&args.sweeps.dataset)?;
+    let run = args.options.run_config(args.batch, args.lr);
     let config = SgLocTrainConfig {
         scenes: args.sweeps.dataset.clone(),
         scene_name: args.sweeps.scene_name.clone(),
         encoder: args.encoder.clone(),
-        run: run_config(&args.options, args.batch, args.lr)?,
+        run: run.map_err(BadInput::of)?,
     };
     let bar = TrainingBar::of(config.run.length);
     let (trained, means) = with_bar(&bar, |observe| train_sgloc(&config, observe))?;

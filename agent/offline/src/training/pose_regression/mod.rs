@@ -98,7 +98,7 @@ fn train<N: PoseLoss>(
 ) -> Result<PoseRegressionSummary, Error> {
     let run = &config.run;
     run.start()?;
-    let (encoder, _) = SceneEncoder::load(&config.encoder, run.device)?;
+    let encoder = SceneEncoder::load(&config.encoder, run.device)?;
     let mut read = |folders: &[PathBuf]| {
         let list = Arc::new(SweepList::open(folders)?);
         let sweeps = PooledSweeps::encode(&list, &encoder, run, observe)?;

@@ -1,31 +1,16 @@
 //! Continued head: a trained head as the start of a training on further sweeps of its scene.
 
-use std::path::Path;
-
 use tch::{Kind, TchError, Tensor, no_grad};
 
 use crate::training::FeatureCache;
 use crate::training::kmeans::nearest;
 use crate::{Error, Result};
-use localization::pgc::head_files::head_config;
-use localization::pgc::{LocalizerError, SceneHead, SceneHeadConfig};
-use perception::weights::Weights;
+use localization::pgc::SceneHead;
 
 /// Number of cells of a sweep that its classification is judged by.
 const CELLS: i64 = 32;
 /// Largest median L1 error of these cells under which a classification is trusted, metres.
 const TRUSTED_M: f64 = 5.0;
-
-/// Reads a head that was trained on the features of the encoder with this SHA-256, and its configuration.
-pub(super) fn load(
-    path: &Path,
-    encoder: &Path,
-    encoder_sha256: &str,
-) -> Result<(Weights, SceneHeadConfig), LocalizerError> {
-    let (weights, config) = head_config(path)?;
-    config.check_encoder(path, encoder, encoder_sha256)?;
-    Ok((weights, config))
-}
 
 /// Class of each sweep of `cache`, which a trained head does not store: the one whose trusted sweeps lie nearest. A
 /// sweep is trusted if the head finds its cells with the class that it gives it.

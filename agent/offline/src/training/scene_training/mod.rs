@@ -9,7 +9,6 @@ mod key_grid;
 mod losses;
 mod statistics;
 
-use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Instant;
 
@@ -28,6 +27,7 @@ use super::scene_validation::{SceneAccuracy, validate};
 use super::sweep_store::SweepList;
 use crate::{Error, Result};
 use localization::pgc::driven_area::DrivenArea;
+use localization::pgc::head_files;
 use localization::pgc::{CellEncoder, LocalizerError, SceneHead, SceneHeadConfig, SweepFormat};
 use perception::train::{
     Curve, DataListing, Length, Means, Observe, SaveEvery, Task, Trainer, TrainingEvent,
@@ -122,8 +122,11 @@ impl<'a> SceneTraining<'a> {
         let format = encoder.format().clone();
         // The encoder is frozen: only its features are needed from here on, and its memory is freed.
         drop(encoder);
-        let load = |init: &PathBuf| continued::load(init, &config.encoder, &sha256);
-        let stored = config.init.as_ref().map(load).transpose()?;
+        let stored = config.init.as_deref().map(head_files::head_config);
+        let stored = stored.transpose()?;
+        if let (Some(init), Some((_, stored))) = (&config.init, &stored) {
+            stored.check_encoder(init, &config.encoder, &sha256)?;
+        }
         let stored_config = stored.as_ref().map(|(_, config)| config);
         let head_config = head_config(config, stored_config, &cache, &format, sha256)?;
         // Coordinates are relative to the origin of the head: f32 is exact enough near it only.

@@ -117,8 +117,17 @@ pub(super) fn figures(experiment: &Experiment, runs: &[Run]) -> Vec<Figure> {
         })
         .collect();
     let figures = varying.iter().map(|dimension| {
-        let charts = [("AP@0.5", 1), ("AP@0.7", 2)]
-            .map(|(title, iou)| chart(experiment, runs, dimension, &varying, title, iou));
+        // Precisions by their place among those at three IoUs.
+        let charts = [("AP@0.5", 1), ("AP@0.7", 2)].map(|(title, iou)| {
+            let series = series(runs, dimension, &varying, iou);
+            let order = runs.first()?.cell.metrics.ap_order().name();
+            Some(Chart {
+                title: format!("{}: {title}", experiment.name),
+                x: axis(dimension, &series)?,
+                y: Axis::linear(&format!("AP, {order} order"), [0.0, 1.0]),
+                series,
+            })
+        });
         Figure {
             name: dimension.name,
             charts: charts.into_iter().flatten().collect(),
@@ -127,42 +136,29 @@ pub(super) fn figures(experiment: &Experiment, runs: &[Run]) -> Vec<Figure> {
     figures.filter(|figure| !figure.charts.is_empty()).collect()
 }
 
-/// A chart of the precisions at one IoU, by its place among them.
-fn chart(
-    experiment: &Experiment,
-    runs: &[Run],
-    dimension: &Dimension,
-    varying: &[&Dimension],
-    title: &str,
-    iou: usize,
-) -> Option<Chart> {
-    let series = series(runs, dimension, varying, iou);
+/// The axis of a chart's field; `None` without values.
+fn axis(dimension: &Dimension, series: &[Series]) -> Option<Axis> {
     let xs = series
         .iter()
         .flat_map(|series| series.points.iter().map(|(x, _)| (*x, *x)));
     let (low, high) = xs.reduce(|a, b| (a.0.min(b.0), a.1.max(b.1)))?;
-    let x = if dimension.name == BANDWIDTH {
+    Some(if dimension.name == BANDWIDTH {
         let first = low.log10().floor();
         // At least one decade, so that the axis has a width where all values are equal.
         let decades = [first, high.log10().ceil().max(first + 1.0)];
         Axis::logarithmic(dimension.label, decades.map(|decade| 10f64.powf(decade)))
     } else {
         Axis::linear(dimension.label, span(low, high, dimension.name == BYTES))
-    };
-    let title = format!("{}: {title}", experiment.name);
-    let order = runs.first()?.cell.metrics.ap_order().name();
-    Some(Chart {
-        title,
-        x,
-        y: Axis::linear(&format!("AP, {order} order"), [0.0, 1.0]),
-        series,
     })
 }
 
 /// Lines of a chart. Along bytes, the cells of all values of a codec form one line; along the noise of the position there
 /// is a line for each noise of the heading, unless they are alike.
 fn series(runs: &[Run], dimension: &Dimension, varying: &[&Dimension], iou: usize) -> Vec<Series> {
-    let names_heading = dimension.name == POSE_NOISE && !is_alike(runs);
+    let mut noises = runs.iter().filter_map(|run| run.point.pose_noise);
+    // True if the noise of each heading, degrees, is the number of that of its position, metres.
+    let is_alike = noises.all(|noise| noise.heading_std_deg == noise.position_std_m);
+    let names_heading = dimension.name == POSE_NOISE && !is_alike;
     let mut series: Vec<(String, GroupedPoints)> = Vec::new();
     for run in runs {
         let precision = run.cell.metrics.headline().values()[iou];
@@ -187,12 +183,6 @@ fn series(runs: &[Run], dimension: &Dimension, varying: &[&Dimension], iou: usiz
     }
     let series = series.into_iter().map(|(name, points)| line(name, points));
     series.collect()
-}
-
-/// True if the noise of each heading, degrees, is the number of that of its position, metres.
-fn is_alike(runs: &[Run]) -> bool {
-    let mut noises = runs.iter().filter_map(|run| run.point.pose_noise);
-    noises.all(|noise| noise.heading_std_deg == noise.position_std_m)
 }
 
 /// Points of a line, grouped for the mean over seeds: by their label, or else by the bits of their x.

@@ -28,6 +28,7 @@ use serde::Serialize;
 use support::bounded_file::{self, MAX_TEXT_BYTES};
 use support::cli::NotWritten;
 use support::file_error::FileError;
+use support::sampling::distinct;
 use support::{atomic_file, output};
 use terminal::progress;
 use training::feature_store::{FeatureStore, KeptMaps};
@@ -305,16 +306,11 @@ impl ExperimentSweep {
     /// Weights of the encoders of some points, each file once.
     fn encoders(&self, points: &[usize]) -> Result<Vec<Arc<Weights>>> {
         let points = points.iter().map(|&index| &self.points[index]);
-        let mut files = Vec::new();
-        for point in points.filter(|point| point.method.exchange() != Exchange::Points) {
-            let file = self
-                .experiment
-                .weights_of(point.method, point.codec.boxes)?;
-            if !files.contains(&file) {
-                files.push(file);
-            }
-        }
-        let precision = self.experiment.precision;
+        let points = points.filter(|point| point.method.exchange() != Exchange::Points);
+        let experiment = &self.experiment;
+        let files = points.map(|point| experiment.weights_of(point.method, point.codec.boxes));
+        let files = distinct(files.collect::<Result<Vec<_>>>()?);
+        let precision = experiment.precision;
         let weights = files.iter().map(|file| Weights::load(file));
         weights
             .map(|loaded| Ok(Arc::new(loaded?.with_precision(precision))))

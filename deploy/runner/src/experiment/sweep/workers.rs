@@ -26,24 +26,51 @@ const REFUSED: &str = "refused";
 /// The run failed without a fault of the input; the reason follows on the same line.
 const FAILED: &str = "failed";
 
-/// Number and identity of a run.
-type CellRequest<'r> = (usize, &'r CellKey);
-
-/// Computes these runs with `jobs` processes; calls `on_frame` and `on_done` for each frame and run.
+/// Computes these runs, of a number and an identity each, with `jobs` processes; calls `on_frame` and `on_done` for each
+/// frame and run.
 pub(super) fn run(
     file: &Path,
     out: &Path,
-    missing: &[CellRequest<'_>],
+    missing: &[(usize, &CellKey)],
     jobs: usize,
     on_frame: &(dyn Fn() + Sync),
     on_done: &(dyn Fn() + Sync),
 ) -> Result<()> {
     let queue = Mutex::new(missing.iter().copied());
-    let failure = Mutex::new(None);
+    let failure: Mutex<Option<Error>> = Mutex::new(None);
+    // Feeds one worker until no run is left, or another worker has failed.
+    let serve = || -> Result<()> {
+        // Wrapped at once, so that no early return leaves the process behind.
+        let mut worker = Worker(start(file, out)?);
+        let mut input = worker.0.stdin.take().ok_or_else(silent)?;
+        let mut output = BufReader::new(worker.0.stdout.take().ok_or_else(silent)?).lines();
+        loop {
+            // After a failure of one worker the others finish their current run and take no other.
+            let has_failed = lock(&failure).is_some();
+            let request = lock(&queue).next();
+            let Some(request) = request.filter(|_| !has_failed) else {
+                return Ok(());
+            };
+            let request = serde_json::to_string(&request)?;
+            writeln!(input, "{request}").map_err(|error| WorkerError(error.to_string()))?;
+            loop {
+                let line = output.next().ok_or_else(silent)?;
+                let line = line.map_err(|error| WorkerError(error.to_string()))?;
+                match line.split_once(' ').unwrap_or((line.as_str(), "")) {
+                    (FRAME, _) => on_frame(),
+                    (DONE, _) => break on_done(),
+                    // The error of this program without workers, so that exit code and message are the same.
+                    (REFUSED, reason) => return Err(Error::msg(reason.to_owned())),
+                    (FAILED, reason) => return Err(WorkerError(reason.to_owned()).into()),
+                    _ => return Err(WorkerError(format!("unexpected answer {line:?}")).into()),
+                }
+            }
+        }
+    };
     std::thread::scope(|scope| {
         for _ in 0..jobs.min(missing.len()) {
             scope.spawn(|| {
-                if let Err(error) = serve(file, out, &queue, &failure, on_frame, on_done) {
+                if let Err(error) = serve() {
                     lock(&failure).get_or_insert(error);
                 }
             });
@@ -51,43 +78,6 @@ pub(super) fn run(
     });
     let failure = failure.into_inner().unwrap_or_else(PoisonError::into_inner);
     failure.map_or(Ok(()), Err)
-}
-
-/// Feeds one worker until no run is left, or another worker has failed.
-fn serve<'r>(
-    file: &Path,
-    out: &Path,
-    queue: &Mutex<impl Iterator<Item = CellRequest<'r>>>,
-    failure: &Mutex<Option<Error>>,
-    on_frame: &dyn Fn(),
-    on_done: &dyn Fn(),
-) -> Result<()> {
-    // Wrapped at once, so that no early return leaves the process behind.
-    let mut worker = Worker(start(file, out)?);
-    let mut input = worker.0.stdin.take().ok_or_else(silent)?;
-    let mut output = BufReader::new(worker.0.stdout.take().ok_or_else(silent)?).lines();
-    loop {
-        // After a failure of one worker the others finish their current run and take no other.
-        let has_failed = lock(failure).is_some();
-        let request = lock(queue).next();
-        let Some(request) = request.filter(|_| !has_failed) else {
-            return Ok(());
-        };
-        let request = serde_json::to_string(&request)?;
-        writeln!(input, "{request}").map_err(|error| WorkerError(error.to_string()))?;
-        loop {
-            let line = output.next().ok_or_else(silent)?;
-            let line = line.map_err(|error| WorkerError(error.to_string()))?;
-            match line.split_once(' ').unwrap_or((line.as_str(), "")) {
-                (FRAME, _) => on_frame(),
-                (DONE, _) => break on_done(),
-                // The error of this program without workers, so that exit code and message are the same.
-                (REFUSED, reason) => return Err(Error::msg(reason.to_owned())),
-                (FAILED, reason) => return Err(WorkerError(reason.to_owned()).into()),
-                _ => return Err(WorkerError(format!("unexpected answer {line:?}")).into()),
-            }
-        }
-    }
 }
 
 /// Answer to a run that was not computed. Only a place that cannot be written is no fault of the input.

@@ -66,11 +66,10 @@ impl ComputeTimes {
         ];
         for (what, takes_nanos) in steps {
             if takes_nanos > period_nanos {
-                return Err(EvaluateError::TooSlow {
-                    what,
-                    takes_ms: takes_nanos as f64 * 1e-6,
-                    period_ms: period_nanos as f64 * 1e-6,
-                });
+                let [takes, period] = [takes_nanos, period_nanos].map(|nanos| nanos as f64 * 1e-6);
+                return Err(EvaluateError::TooSlow(format!(
+                    "{what} takes {takes:.0} ms, but the scene has a frame every {period:.0} ms"
+                )));
             }
         }
         Ok(())

@@ -182,19 +182,14 @@ impl DelayedDelivery {
         Some(envelope)
     }
 
-    /// The ego has used a message. That of its own agent takes no link.
-    pub(super) fn received(&mut self, (cav, stream): &Source) {
+    /// The ego has used a message, or not for a reason. That of its own agent takes no link.
+    pub(super) fn count(&mut self, (cav, stream): &Source, reason: Option<DropReason>) {
         if *cav != self.ego {
             let account = Account::towards(Topic::stream(cav, *stream), &self.receiver);
-            self.ledger.received(&account);
-        }
-    }
-
-    /// The ego has not used a message. That of its own agent takes no link.
-    pub(super) fn dropped(&mut self, (cav, stream): &Source, reason: DropReason) {
-        if *cav != self.ego {
-            let account = Account::towards(Topic::stream(cav, *stream), &self.receiver);
-            self.ledger.dropped(&account, reason);
+            match reason {
+                Some(reason) => self.ledger.dropped(&account, reason),
+                None => self.ledger.received(&account),
+            }
         }
     }
 

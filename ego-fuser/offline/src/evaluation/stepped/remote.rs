@@ -16,7 +16,7 @@ use bus::{
     Subscription, process_id,
 };
 use dataset::frame::Frame;
-use protocol::{CavId, Lidar, Limits, Role, Stream, Topic, WireError, wire};
+use protocol::{CavId, Lidar, Limits, Role, Stream, Topic, wire};
 
 use super::super::sent::{Replies, Sent};
 
@@ -32,22 +32,9 @@ pub enum RemoteError {
     /// Not all processes joined.
     #[error(transparent)]
     NotReady(#[from] NotReady),
-    /// A vehicle does not answer.
-    #[error("no answer of {cavs} to the sweep of {capture_nanos} ns; see their logs")]
-    Silent {
-        /// Vehicles without an answer, separated by commas.
-        cavs: String,
-        /// Capture time of the sweep.
-        capture_nanos: u64,
-    },
-    /// A vehicle's message is invalid.
-    #[error("{topic}: {source}")]
-    Unsound {
-        /// Topic of the message.
-        topic: Topic,
-        /// Cause.
-        source: WireError,
-    },
+    /// Vehicles do not answer, or a message of one is invalid: the text names them, or its topic.
+    #[error("{0}")]
+    Answer(String),
 }
 
 /// Streams of a vehicle's sweeps.
@@ -158,20 +145,18 @@ impl RemotePool {
                         let message = wire::decode_any(arrival.pieces(), &Limits::DEFAULT);
                         message
                             .and_then(|(_, message)| answer.note(message, arrival.wire_bytes()))
-                            .map_err(|source| RemoteError::Unsound {
-                                topic: topic.clone(),
-                                source,
-                            })?;
+                            .map_err(|error| RemoteError::Answer(format!("{topic}: {error}")))?;
                     }
                 }
                 Pop::Item(..) => {}
                 Pop::TimedOut | Pop::Closed => {
                     answers.retain(|cav, answer| self.awaits(cav, answer));
                     let silent: Vec<String> = answers.keys().map(ToString::to_string).collect();
-                    return Err(RemoteError::Silent {
-                        cavs: silent.join(", "),
-                        capture_nanos: frames.first().map_or(0, |f| f.capture_nanos),
-                    });
+                    let capture_nanos = frames.first().map_or(0, |f| f.capture_nanos);
+                    return Err(RemoteError::Answer(format!(
+                        "no answer of {} to the sweep of {capture_nanos} ns; see their logs",
+                        silent.join(", ")
+                    )));
                 }
             }
         }
