@@ -13,7 +13,7 @@ use perception::train::{Length, RunConfig, TrainingEvent};
 
 /// Observer of a training.
 #[derive(Default)]
-pub struct Ear {
+pub struct EventLog {
     /// Loss of each reported step.
     pub losses: Vec<f64>,
     /// Results of the validations in words.
@@ -22,9 +22,9 @@ pub struct Ear {
     pub encoded: usize,
 }
 
-impl Ear {
+impl EventLog {
     /// Takes an event in.
-    pub fn hear(&mut self, event: &TrainingEvent) {
+    pub fn add(&mut self, event: &TrainingEvent) {
         match event {
             TrainingEvent::Encoding(..) => self.encoded += 1,
             TrainingEvent::Stepped(report) => self.losses.push(report.means[0]),

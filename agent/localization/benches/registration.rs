@@ -6,8 +6,8 @@ use std::hint::black_box;
 use std::time::Instant;
 
 use criterion::{Criterion, criterion_group, criterion_main};
-use localization::registration::ransac::{self, MinimalSolver, RansacConfig};
-use localization::registration::sc2pcr::{self, Refinement, Sc2PcrConfig};
+use localization::registration::ransac::{self, RansacConfig};
+use localization::registration::sc2pcr::{self, Sc2PcrConfig};
 use localization::registration::{Correspondence, NoRegistration, Registration};
 use nalgebra::{Isometry3, Point3, Translation3, UnitQuaternion};
 use rand::{Rng, SeedableRng};
@@ -134,22 +134,14 @@ type Solver<'a> = (
 
 fn solvers(shape: &Shape) -> Vec<Solver<'_>> {
     let threshold_m = shape.threshold_m;
-    let any = RansacConfig::any_rotation(threshold_m);
     let upright = RansacConfig {
         inlier_threshold_m: threshold_m,
         ..RansacConfig::default()
     };
-    let three = RansacConfig {
-        minimal: MinimalSolver::ThreePoint,
-        ..upright.clone()
-    };
     let second_order = Sc2PcrConfig {
         inlier_threshold_m: threshold_m,
         distance_threshold_m: threshold_m,
-        refinement: Some(Refinement {
-            threshold_m,
-            rounds: 20,
-        }),
+        refinement_threshold_m: threshold_m,
         ..Sc2PcrConfig::default()
     };
     let mut solvers: Vec<Solver<'_>> = vec![(
@@ -161,12 +153,6 @@ fn solvers(shape: &Shape) -> Vec<Solver<'_>> {
             "ransac2",
             Box::new(move |pairs| ransac::solve(pairs, &upright)),
         ));
-        solvers.push((
-            "ransac3",
-            Box::new(move |pairs| ransac::solve(pairs, &three)),
-        ));
-    } else {
-        solvers.push(("ransac3", Box::new(move |pairs| ransac::solve(pairs, &any))));
     }
     solvers
 }

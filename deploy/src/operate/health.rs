@@ -64,12 +64,9 @@ pub struct ProcessStatus {
     pub problems: Vec<String>,
     /// Time since its last report, seconds.
     pub silent_s: Option<f64>,
-    /// Resident memory, MiB.
-    pub resident_mib: Option<f64>,
-    /// Number of threads.
-    pub threads: Option<u64>,
-    /// Number of open descriptors.
-    pub descriptors: Option<u64>,
+    /// Resources, while it runs.
+    #[serde(flatten)]
+    pub usage: Usage,
 }
 
 /// Record of one process.
@@ -253,14 +250,11 @@ impl Health {
             let Some(pid) = noted.status.pid else {
                 return noted.status.clone();
             };
-            let usage = Usage::of(pid).unwrap_or_default();
             ProcessStatus {
                 up_s: elapsed_s(noted.started, now),
                 problems: progress.problems.get(name).cloned().unwrap_or_default(),
                 silent_s: noted.last_report.map(|at| elapsed_s(at, now)),
-                resident_mib: usage.resident_mib,
-                threads: usage.threads,
-                descriptors: usage.descriptors,
+                usage: Usage::of(pid).unwrap_or_default(),
                 ..noted.status.clone()
             }
         });
@@ -273,7 +267,7 @@ fn elapsed_s(since: Instant, now: Instant) -> f64 {
 }
 
 /// Resources of a process, from `/proc`.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct Usage {
     /// Resident memory, MiB.
     pub resident_mib: Option<f64>,
@@ -282,6 +276,7 @@ pub struct Usage {
     /// Number of open descriptors.
     pub descriptors: Option<u64>,
     /// True if a signal has stopped it (Ctrl-Z).
+    #[serde(skip)]
     pub is_stopped: bool,
 }
 

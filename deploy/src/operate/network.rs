@@ -57,7 +57,7 @@ impl Network {
     /// [`BusError`] when the port is in use or the endpoint is invalid.
     pub fn endpoint(&self, has_keys: bool) -> Result<Endpoint, BusError> {
         match &self.connect {
-            Some(router) => Endpoint::new(router),
+            Some(router) => router.parse(),
             None => free_endpoint(&self.listen, has_keys),
         }
     }
@@ -124,15 +124,15 @@ fn as_scorer(options: BusOptions, keys: Option<&RunKeys>) -> Result<BusOptions, 
 /// certificates carry.
 pub(crate) fn from_here(endpoint: &Endpoint) -> Result<Endpoint, BusError> {
     let text = endpoint.as_str().replacen("/0.0.0.0:", "/127.0.0.1:", 1);
-    Endpoint::new(&text.replacen("/[::]:", "/[::1]:", 1))
+    text.replacen("/[::]:", "/[::1]:", 1).parse()
 }
 
 /// A listening address that is free at this moment; port 0 is replaced by a free port.
 fn free_endpoint(listen: &str, has_keys: bool) -> Result<Endpoint, BusError> {
-    let endpoint = Endpoint::new(listen)?;
+    let endpoint: Endpoint = listen.parse()?;
     match (free_address(&endpoint, has_keys), listen.strip_suffix(":0")) {
         // If another program takes the port in between, the router's log has the error.
-        (Ok(free), Some(place)) => Endpoint::new(&format!("{place}:{}", free.port())),
+        (Ok(free), Some(place)) => format!("{place}:{}", free.port()).parse(),
         (Err(error), _) if error.kind() == ErrorKind::AddrInUse => {
             Err(BusError::PortInUse(endpoint))
         }
@@ -170,10 +170,7 @@ mod tests {
             ("tcp/[::]:7447", "tcp/[::1]:7447"),
             ("tcp/10.0.0.1:7447", "tcp/10.0.0.1:7447"),
         ] {
-            assert_eq!(
-                from_here(&Endpoint::new(listen).unwrap()).unwrap().as_str(),
-                met
-            );
+            assert_eq!(from_here(&listen.parse().unwrap()).unwrap().as_str(), met);
         }
     }
 

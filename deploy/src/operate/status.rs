@@ -212,8 +212,8 @@ impl RunStatus {
                 format!("{:.0}", process.up_s),
                 process.restarts.to_string(),
                 number(process.silent_s, 1),
-                number(process.resident_mib, 0),
-                number(process.descriptors.map(|count| count as f64), 0),
+                number(process.usage.resident_mib, 0),
+                number(process.usage.descriptors.map(|count| count as f64), 0),
                 why(process).unwrap_or_default(),
             ]);
         }
@@ -367,9 +367,12 @@ mod tests {
             failure: (state == State::Failing).then(|| "recording cut".into()),
             problems: vec![],
             silent_s: Some(0.2),
-            resident_mib: Some(150.0),
-            threads: Some(20),
-            descriptors: Some(31),
+            usage: Usage {
+                resident_mib: Some(150.0),
+                threads: Some(20),
+                descriptors: Some(31),
+                is_stopped: false,
+            },
         }
     }
 

@@ -5,7 +5,7 @@
 use std::time::{Duration, Instant};
 
 use bus::bounded_queue::Pop;
-use bus::{Bus, BusOptions, Endpoint, Identity, process_id};
+use bus::{Bus, BusOptions, Identity, process_id};
 use protocol::{CavId, Detections, KeyExpr, Limits, Role, RunId, Stream, wire};
 
 const SILENCE: Duration = Duration::from_secs(10);
@@ -21,7 +21,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         process: process_id(Role::Viewer, &cav),
         cav,
     };
-    let bus = Bus::join(&BusOptions::client(Endpoint::new(&endpoint)?), identity)?;
+    let bus = Bus::join(&BusOptions::client(endpoint.parse()?), identity)?;
     // A passive subscriber joins and leaves at any time: nobody waits for it, and no account of the run counts it.
     let detections = bus.tap(&[KeyExpr::stream(&run, Stream::Detections)], 8)?;
     while let Pop::Item(_, message) = detections.take(Some(Instant::now() + SILENCE)) {

@@ -19,17 +19,6 @@ pub struct Endpoint(String);
 protocol::written_as_text!(Endpoint);
 
 impl Endpoint {
-    /// Parses `tcp/HOST:PORT` or `quic/HOST:PORT`; IPv6 hosts are in brackets.
-    ///
-    /// # Errors
-    /// [`BusError::Endpoint`] states the text that is not an endpoint.
-    pub fn new(text: &str) -> Result<Self, BusError> {
-        if !is_endpoint(text) {
-            return Err(BusError::Endpoint(text.chars().take(100).collect()));
-        }
-        Ok(Self(text.into()))
-    }
-
     /// The endpoint on this machine's loopback at `port`.
     pub fn loopback(port: u16) -> Self {
         Self(format!("tcp/127.0.0.1:{port}"))
@@ -99,8 +88,15 @@ impl fmt::Display for Endpoint {
 impl std::str::FromStr for Endpoint {
     type Err = BusError;
 
+    /// Parses `tcp/HOST:PORT` or `quic/HOST:PORT`; IPv6 hosts are in brackets.
+    ///
+    /// # Errors
+    /// [`BusError::Endpoint`] states the text that is not an endpoint.
     fn from_str(text: &str) -> Result<Self, BusError> {
-        Self::new(text)
+        if !is_endpoint(text) {
+            return Err(BusError::Endpoint(text.chars().take(100).collect()));
+        }
+        Ok(Self(text.into()))
     }
 }
 
@@ -116,7 +112,7 @@ mod tests {
             "tcp/[::1]:1",
             "tcp/localhost:1",
         ] {
-            assert!(Endpoint::new(text).unwrap().is_loopback(), "{text}");
+            assert!(text.parse::<Endpoint>().unwrap().is_loopback(), "{text}");
         }
         for text in [
             "tcp/0.0.0.0:1",
@@ -124,7 +120,7 @@ mod tests {
             "tcp/[::]:1",
             "tcp/router.local:1",
         ] {
-            assert!(!Endpoint::new(text).unwrap().is_loopback(), "{text}");
+            assert!(!text.parse::<Endpoint>().unwrap().is_loopback(), "{text}");
         }
     }
 
@@ -136,7 +132,7 @@ mod tests {
             "tcp/router.local:1",
             "quic/router.local:1",
         ] {
-            assert_eq!(Endpoint::new(text).unwrap().as_str(), text);
+            assert_eq!(text.parse::<Endpoint>().unwrap().as_str(), text);
         }
         for text in [
             "",
@@ -149,7 +145,7 @@ mod tests {
             "tcp/a b:1",
             "tcp/::1:1",
         ] {
-            let error = Endpoint::new(text).unwrap_err();
+            let error = text.parse::<Endpoint>().unwrap_err();
             assert!(
                 error.to_string().contains("tcp/HOST:PORT"),
                 "{text}: {error}"

@@ -2,13 +2,15 @@
 
 use std::time::Duration;
 
+use prometheus_client::metrics::histogram::Histogram;
+
 /// Upper bounds of the latency histogram's buckets, seconds: finest where live runs are.
 const LATENCY_BUCKETS_S: [f64; 16] = [
     0.02, 0.04, 0.06, 0.08, 0.1, 0.12, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5, 0.75, 1.0, 2.0, 5.0,
 ];
 
 /// Counters of frames since the process started.
-#[derive(Debug, Clone, PartialEq, Default)]
+#[derive(Debug, Clone, Default)]
 pub struct FrameStats {
     /// Ticks of the scene, for a process that knows them.
     pub ticks: u64,
@@ -16,11 +18,8 @@ pub struct FrameStats {
     pub answered: u64,
     /// Neighbours whose data were fused, over all frames.
     pub fused_neighbours: u64,
-    /// Sum of the latencies from the publication of a tick to that of its detections, seconds.
-    pub latency_sum_s: f64,
-    /// Number of these latencies.
-    pub latencies: u64,
-    buckets: [u64; LATENCY_BUCKETS_S.len() + 1],
+    /// Latencies from the publication of a tick to that of its detections, seconds; `None` before the first one.
+    pub latency: Option<Histogram>,
 }
 
 impl FrameStats {
@@ -28,20 +27,11 @@ impl FrameStats {
     pub(super) fn answer(&mut self, latency: Option<Duration>, fused_neighbours: usize) {
         self.answered += 1;
         self.fused_neighbours += fused_neighbours as u64;
-        if let Some(latency_s) = latency.map(|latency| latency.as_secs_f64()) {
-            self.latency_sum_s += latency_s;
-            self.latencies += 1;
-            let bucket = LATENCY_BUCKETS_S.partition_point(|end| *end < latency_s);
-            if let Some(count) = self.buckets.get_mut(bucket) {
-                *count += 1;
-            }
+        if let Some(latency) = latency {
+            let known = self
+                .latency
+                .get_or_insert_with(|| Histogram::new(LATENCY_BUCKETS_S));
+            known.observe(latency.as_secs_f64());
         }
-    }
-
-    /// Upper bound in seconds and number of frames of every bucket of the latency; the last is unbounded
-    /// ([`f64::MAX`]).
-    pub fn latency_buckets(&self) -> Vec<(f64, u64)> {
-        let ends = LATENCY_BUCKETS_S.into_iter().chain([f64::MAX]);
-        ends.zip(self.buckets).collect()
     }
 }

@@ -46,13 +46,6 @@ pub enum SharedMemoryUse {
     RouterNotAttached,
 }
 
-impl SharedMemoryUse {
-    /// Its name in metrics.
-    pub fn as_str(self) -> &'static str {
-        self.into()
-    }
-}
-
 #[derive(Debug, Default)]
 struct CounterState {
     ledger: Ledger,
@@ -183,7 +176,7 @@ impl MessageStats {
         };
         if is_first && way != SharedMemoryUse::Carried {
             tracing::warn!(
-                reason = way.as_str(),
+                reason = <&str>::from(way),
                 "a large message takes the socket instead of shared memory"
             );
         }

@@ -105,18 +105,12 @@ fn encode_frames(frames: &FrameStats, encoder: &mut DescriptorEncoder<'_>) -> fm
     let help = "Neighbours whose data were fused, over all frames";
     let fused = ConstCounter::new(frames.fused_neighbours);
     encode_value(encoder, ("fused_neighbours", help), None, &fused)?;
-    if frames.latencies == 0 {
+    let Some(latency) = &frames.latency else {
         return Ok(());
-    }
+    };
     let help = "From the publication of a tick to that of its detections";
-    let mut latency = encoder.encode_descriptor(
-        "capture_to_detection",
-        help,
-        Some(&Unit::Seconds),
-        MetricType::Histogram,
-    )?;
-    let buckets = frames.latency_buckets();
-    latency.encode_histogram::<NoLabels>(frames.latency_sum_s, frames.latencies, &buckets, None)
+    let about = ("capture_to_detection", help);
+    encode_value(encoder, about, Some(&Unit::Seconds), latency)
 }
 
 /// Encodes a metric, given by name and help: a value for each set of labels.
@@ -191,7 +185,8 @@ impl Collector for StatsCollector {
         encode_series(&mut encoder, help, None, series)?;
         let help = "Large messages of a process with a pool of shared memory, by their way";
         let series = self.0.shared_memory().into_iter();
-        let series = series.map(|(way, count)| ([("way", way.as_str())], ConstCounter::new(count)));
+        let series =
+            series.map(|(way, count)| ([("way", <&str>::from(way))], ConstCounter::new(count)));
         encode_series(&mut encoder, ("shared_memory_messages", help), None, series)?;
         let help = "Bytes of published messages, each counted once for all its receivers";
         let help = ("published", help);

@@ -29,22 +29,13 @@ const PROBE_PERIOD: Duration = Duration::from_millis(50);
 /// message.
 const SMALL_BYTES: usize = 16 << 10;
 
-/// Behaviour when the network still takes an earlier message.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Overflow {
-    /// Bounded queue of this length, KEEP_LAST: the newest message replaces the oldest, which is counted as superseded.
-    /// For data that are measured periodically.
-    KeepLast(usize),
-    /// Bounded queue of this length; the producer waits when it is full. For messages that must not be lost, and for
-    /// paced runs.
-    Wait(usize),
-}
-
 /// Options of a publisher.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct PublisherOptions {
-    /// Behaviour on overload.
-    pub overflow: Overflow,
+    /// Behaviour when the network still takes an earlier message. `None`, KEEP_LAST: the newest message replaces the one
+    /// that waits, which is counted as superseded; for data that are measured periodically. Otherwise the length of a
+    /// bounded queue, and the producer waits when it is full; for messages that must not be lost, and for paced runs.
+    pub waiting_places: Option<usize>,
     /// Priority in the transport; a large message does not delay one of higher priority.
     pub priority: Priority,
     /// Sends at once rather than after the batching timer.
@@ -78,7 +69,7 @@ impl PublisherOptions {
 
     const fn new(priority: Priority, express: bool) -> Self {
         Self {
-            overflow: Overflow::KeepLast(1),
+            waiting_places: None,
             priority,
             express,
             is_for_onlookers: false,
@@ -96,7 +87,7 @@ impl PublisherOptions {
     /// The same, but the producer waits for a place among `places` instead of replacing a message.
     #[must_use]
     pub const fn waiting(mut self, places: usize) -> Self {
-        self.overflow = Overflow::Wait(places);
+        self.waiting_places = Some(places);
         self
     }
 
@@ -121,12 +112,12 @@ type Submission = (u64, Encode);
 /// a number by which receivers count what it has dropped for them. As a consequence `put` waits for the network, for seconds on a slow one,
 /// so neither a clock nor a network thread nor an async task may call it.
 ///
-/// With [`Overflow::KeepLast`] the next large message is taken only when the router has the previous one: `put`
-/// returns as soon as a message is in the buffers of zenoh and of the system, which hold a megabyte, and feature maps
-/// would become stale there on a slow link.
+/// Without [`PublisherOptions::waiting_places`] the next large message is taken only when the router has the previous
+/// one: `put` returns as soon as a message is in the buffers of zenoh and of the system, which hold a megabyte, and
+/// feature maps would become stale there on a slow link.
 pub struct Publisher {
     topic: Topic,
-    overflow: Overflow,
+    waits: bool,
     queue: Arc<BoundedQueue<(), Submission>>,
     stats: MessageStats,
     /// True while there are subscribers; only for droppable topics.
@@ -163,13 +154,12 @@ impl Publisher {
             .express(options.express)
             .wait()
             .map_err(|cause| BusError::zenoh(format!("declaring a publisher on {key}"), &cause))?;
-        let (Overflow::KeepLast(places) | Overflow::Wait(places)) = options.overflow;
         let has_subscribers = options
             .is_for_onlookers
             .then(|| has_subscribers(&publisher))
             .transpose()
             .map_err(|cause| BusError::zenoh(format!("asking for subscribers of {key}"), &cause))?;
-        let queue = Arc::new(BoundedQueue::new(places, 1));
+        let queue = Arc::new(BoundedQueue::new(options.waiting_places.unwrap_or(1), 1));
         let sender = SendingThread {
             topic: topic.clone(),
             cav: cav.clone(),
@@ -183,14 +173,13 @@ impl Publisher {
             handed_over: 0,
             publisher,
             receipt: FlushBarrier::new(session, &key.run, options.priority),
-            is_one_at_a_time: matches!(options.overflow, Overflow::KeepLast(_))
-                && !options.is_for_onlookers,
+            is_one_at_a_time: options.waiting_places.is_none() && !options.is_for_onlookers,
         };
         let thread = spawn(format!("send {topic}"), move || sender.run());
         let thread = thread.map_err(BusError::thread(format!("sending {key}")))?;
         Ok(Self {
             topic,
-            overflow: options.overflow,
+            waits: options.waiting_places.is_some(),
             queue,
             stats: stats.clone(),
             has_subscribers,
@@ -210,8 +199,8 @@ impl Publisher {
         &self.topic
     }
 
-    /// Submits a message captured at `capture_nanos`. Returns at once, except under [`Overflow::Wait`] with a full
-    /// queue.
+    /// Submits a message captured at `capture_nanos`. Returns at once, except with
+    /// [`PublisherOptions::waiting_places`] and a full queue.
     pub fn submit<M: Payload + Send + 'static>(&self, capture_nanos: u64, message: M) {
         self.submit_encoded(capture_nanos, move |stamp| wire::encode(stamp, message));
     }
@@ -255,9 +244,9 @@ impl Publisher {
     fn push(&self, capture_nanos: u64, encode: Encode) {
         self.stats.submitted(&self.topic);
         let submission = (capture_nanos, encode);
-        let pushed = match self.overflow {
-            Overflow::KeepLast(_) => self.queue.push((), submission),
-            Overflow::Wait(_) => self.queue.push_waiting((), submission),
+        let pushed = match self.waits {
+            true => self.queue.push_waiting((), submission),
+            false => self.queue.push((), submission),
         };
         // Replaced, or refused after the end: in either case one submitted message is not sent.
         if !matches!(pushed, PushOutcome::Queued) {

@@ -68,21 +68,15 @@ pub fn process_id(role: Role, cav: &CavId) -> ProcessId {
     Principal::new(role, cav).name()
 }
 
-/// A text that is not a route.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("{text:?} is not a route TOPIC>PROCESS such as 4279/lidar>agent-4279: {detail}")]
-pub struct RouteError {
-    text: String,
-    detail: String,
-}
-
 impl FromStr for Route {
-    type Err = RouteError;
+    type Err = String;
 
-    fn from_str(text: &str) -> Result<Self, RouteError> {
-        Self::parse(text).map_err(|detail| RouteError {
-            text: text.chars().take(100).collect(),
-            detail,
+    fn from_str(text: &str) -> Result<Self, String> {
+        Self::parse(text).map_err(|detail| {
+            let shown: String = text.chars().take(100).collect();
+            format!(
+                "{shown:?} is not a route TOPIC>PROCESS such as 4279/lidar>agent-4279: {detail}"
+            )
         })
     }
 }

@@ -255,7 +255,7 @@ pub(crate) fn listen(
         error("run: give the name of the run; `v2vloc up` prints it, `v2vloc status` lists runs")
     })?;
     let run = RunId::new(run).map_err(error)?;
-    let endpoint = Endpoint::new(endpoint).map_err(error)?;
+    let endpoint = endpoint.parse::<Endpoint>().map_err(error)?;
     let timeout = timeout_s
         .map(|seconds| seconds_of("timeout_s", seconds))
         .transpose()?;

@@ -17,11 +17,13 @@ pub const ATTACHMENT_LEN: usize = 33;
 pub type Gid = [u8; 16];
 
 /// Kind of an endpoint.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, strum::Display)]
 pub enum EndpointKind {
     /// Publisher of a topic.
+    #[strum(serialize = "MP")]
     Publisher,
     /// Subscription to a topic.
+    #[strum(serialize = "MS")]
     Subscription,
 }
 
@@ -111,10 +113,6 @@ impl Node {
         qos: Qos,
     ) -> String {
         let (domain, zid) = (self.domain_id, &self.zid);
-        let kind = match kind {
-            EndpointKind::Publisher => "MP",
-            EndpointKind::Subscription => "MS",
-        };
         let (identity, topic) = (self.identity(), mangled(topic.as_str()));
         let name = ros_type.dds_name();
         let hash = ros_type.hash(self.distribution);

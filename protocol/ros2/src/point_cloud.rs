@@ -73,7 +73,8 @@ pub fn read_point_cloud(bytes: &[u8], limits: &Limits) -> Result<RosSweep, ReadE
 }
 
 /// Datatypes of `sensor_msgs/PointField`.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, strum::FromRepr)]
+#[repr(u8)]
 enum Datatype {
     Int8 = 1,
     Uint8,
@@ -86,12 +87,6 @@ enum Datatype {
 }
 
 impl Datatype {
-    fn of(number: u8) -> Option<Self> {
-        use Datatype::{Float32, Float64, Int8, Int16, Int32, Uint8, Uint16, Uint32};
-        let all = [Int8, Uint8, Int16, Uint16, Int32, Uint32, Float32, Float64];
-        all.into_iter().find(|datatype| *datatype as u8 == number)
-    }
-
     /// Bytes of a value.
     fn size(self) -> u32 {
         match self {
@@ -215,7 +210,7 @@ fn column<'a>(
     else {
         return Ok(None);
     };
-    match Datatype::of(field.datatype).filter(|datatype| is_allowed(*datatype)) {
+    match Datatype::from_repr(field.datatype).filter(|datatype| is_allowed(*datatype)) {
         // Some drivers leave the count at 0.
         Some(datatype) if field.count <= 1 => {
             let offset = field.offset;

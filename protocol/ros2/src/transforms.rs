@@ -7,16 +7,20 @@ use crate::read::{ReadError, Reader};
 /// More transforms than any robot publishes in one message.
 const MAX_TRANSFORMS: u32 = 10_000;
 
-/// A message that poses can be read from.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+/// A message that poses can be read from; parsed from its type's name, `nav_msgs/msg/Odometry` for example.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, strum::EnumString)]
 pub enum PoseType {
     /// `nav_msgs/Odometry`: the child frame in the frame of the header.
+    #[strum(serialize = "nav_msgs/msg/Odometry")]
     Odometry,
     /// `geometry_msgs/PoseStamped`: a frame that is not named in the frame of the header.
+    #[strum(serialize = "geometry_msgs/msg/PoseStamped")]
     PoseStamped,
     /// `geometry_msgs/PoseWithCovarianceStamped`: as [`Self::PoseStamped`].
+    #[strum(serialize = "geometry_msgs/msg/PoseWithCovarianceStamped")]
     PoseWithCovarianceStamped,
     /// `tf2_msgs/TFMessage`: any number of child frames, each in the frame of its own header.
+    #[strum(serialize = "tf2_msgs/msg/TFMessage")]
     TfMessage,
 }
 
@@ -34,17 +38,6 @@ pub struct Transform {
 }
 
 impl PoseType {
-    /// The type of this name, `nav_msgs/msg/Odometry` for example.
-    pub fn of_name(name: &str) -> Option<Self> {
-        match name {
-            "nav_msgs/msg/Odometry" => Some(Self::Odometry),
-            "geometry_msgs/msg/PoseStamped" => Some(Self::PoseStamped),
-            "geometry_msgs/msg/PoseWithCovarianceStamped" => Some(Self::PoseWithCovarianceStamped),
-            "tf2_msgs/msg/TFMessage" => Some(Self::TfMessage),
-            _ => None,
-        }
-    }
-
     /// Reads a message in CDR, with its encapsulation header. Leading slashes of frames, as ROS 1 has them, are left out.
     ///
     /// # Errors
@@ -122,7 +115,7 @@ mod tests {
     }
 
     fn read_as(name: &str, bytes: &[u8]) -> Result<Vec<Transform>, ReadError> {
-        PoseType::of_name(name).unwrap().read(bytes)
+        name.parse::<PoseType>().unwrap().read(bytes)
     }
 
     #[test]
@@ -143,7 +136,7 @@ mod tests {
             [expected(None)]
         );
         assert_eq!(read_header(&odometry), Ok((5_000_000_006, "odom".into())));
-        assert_eq!(PoseType::of_name("sensor_msgs/msg/Imu"), None);
+        assert!("sensor_msgs/msg/Imu".parse::<PoseType>().is_err());
     }
 
     #[test]

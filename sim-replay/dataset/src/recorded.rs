@@ -268,9 +268,8 @@ pub(super) fn as_read_error(error: RecordingError) -> ReadError {
     match error {
         RecordingError::Foreign { ref path, .. } => ReadError::malformed(path, error.to_string()),
         RecordingError::Io { path, source } => ReadError::Io { path, source },
-        RecordingError::NotOurs { path, reason } | RecordingError::Ended { path, reason } => {
-            ReadError::malformed(&path, reason)
-        }
+        RecordingError::NotOurs(file) => ReadError::malformed(&file.path, file.problem),
+        RecordingError::Ended { path, reason } => ReadError::malformed(&path, reason),
         RecordingError::Malformed {
             path,
             offset,

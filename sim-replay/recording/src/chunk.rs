@@ -10,7 +10,7 @@ use mcap::records::{Record, op};
 use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions};
 use mcap::{Channel, MAGIC, McapError, McapResult, Message, parse_record};
 
-use super::is_own;
+use super::OWN_ENCODING;
 use super::lengths::{self, RECORD_HEAD};
 use super::records::MAX_RECORD_BYTES;
 
@@ -53,7 +53,7 @@ impl Channels {
         let mut named = (0..=u16::MAX)
             .filter_map(|id| self.repeated.get(id))
             .peekable();
-        named.peek().is_some() && named.all(|channel| !is_own(&channel.message_encoding))
+        named.peek().is_some() && named.all(|channel| channel.message_encoding != OWN_ENCODING)
     }
 
     pub(super) fn get(&self, id: u16) -> Option<Arc<Channel<'static>>> {

@@ -2,6 +2,8 @@
 
 use std::path::{Path, PathBuf};
 
+use support::file_error::FileError;
+
 use super::OWN_ENCODING;
 
 /// Result of reading or writing a recording: a [`RecordingError`] if nothing else is named.
@@ -30,13 +32,8 @@ pub enum RecordingError {
         what: String,
     },
     /// The file is no MCAP file, or none of its messages can be read.
-    #[error("{}: {reason}", path.display())]
-    NotOurs {
-        /// The file.
-        path: PathBuf,
-        /// Expected and found content.
-        reason: String,
-    },
+    #[error(transparent)]
+    NotOurs(FileError),
     /// A record of the file is invalid.
     #[error("{}, byte {offset}: {reason}", path.display())]
     Malformed {
@@ -72,10 +69,7 @@ impl RecordingError {
         }
     }
 
-    pub(super) fn not_ours(path: &Path, reason: impl Into<String>) -> Self {
-        Self::NotOurs {
-            path: path.into(),
-            reason: reason.into(),
-        }
+    pub(super) fn not_ours(path: &Path, reason: impl std::fmt::Display) -> Self {
+        Self::NotOurs(FileError::new(path, reason))
     }
 }

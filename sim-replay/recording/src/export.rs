@@ -12,13 +12,15 @@ use super::{
 };
 
 /// Times of the messages in a bag.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, clap::ValueEnum)]
 pub enum ExportTimes {
     /// Capture times, as in the headers: `ros2 bag play --clock` gives `/clock` and stamps on one time base. Latencies are
     /// lost.
     #[default]
+    #[value(help = "Capture times, as in the headers")]
     Capture,
     /// Times of arrival at the recorder, on the Unix clock.
+    #[value(help = "Arrival at the recorder")]
     Arrival,
 }
 

@@ -72,10 +72,5 @@ pub use writer::{Contents, RecordingOptions, RecordingWriter};
 /// Encoding of the channels that hold messages as transmitted.
 pub(crate) const OWN_ENCODING: &str = "v2vloc";
 
-/// True for channels that hold messages as transmitted.
-pub(crate) fn is_own(encoding: &str) -> bool {
-    encoding == OWN_ENCODING
-}
-
 #[cfg(test)]
 mod tests;

@@ -15,7 +15,7 @@ use super::chunk::{Channels, in_words, unpack};
 use super::damage::Damage;
 use super::lengths::{self, RECORD_HEAD};
 use super::records::{RawRecord, Records};
-use super::{RecordingError, is_own};
+use super::{OWN_ENCODING, RecordingError};
 
 /// Unpacked chunks in the cache: neighbours in time are neighbours in the file.
 const KEPT_CHUNKS: usize = 4;
@@ -232,7 +232,7 @@ impl FileScan<'_> {
                     let has_chunks = self.has_chunks();
                     records.seek(begin + 1, |id| {
                         let channel = (!has_chunks).then(|| self.channels.get(id)).flatten();
-                        channel.is_some_and(|channel| is_own(&channel.message_encoding))
+                        channel.is_some_and(|channel| channel.message_encoding == OWN_ENCODING)
                     })?;
                     self.lose((begin, records.at), reason);
                 }
@@ -282,7 +282,7 @@ impl FileScan<'_> {
     fn take_message(&mut self, begin: u64, body: &[u8]) -> Result<(), String> {
         let message = self.channels.message(body).map_err(in_words)?;
         let message = message.ok_or("a message of a channel that is described nowhere")?;
-        if is_own(&message.channel.message_encoding) {
+        if message.channel.message_encoding == OWN_ENCODING {
             let stated = lengths::own_message(&message.data)
                 .ok_or("a damaged message, or one of another version of this program")?;
             if stated != message.data.len() as u64 {

@@ -6,7 +6,7 @@ use protocol::{Header, Key, wire};
 
 use super::damage::Damage;
 use super::mcap_file::{McapFile, McapPlace, is_foreign};
-use super::{RecordingError, is_own};
+use super::{OWN_ENCODING, RecordingError};
 
 /// A message of a recording: its position and its header.
 #[derive(Debug, Clone)]
@@ -41,7 +41,7 @@ impl Recording {
         let mut entries = Vec::new();
         let file = McapFile::open(path, &mut |message, place| {
             has_any = true;
-            if !is_own(&message.channel.message_encoding) {
+            if message.channel.message_encoding != OWN_ENCODING {
                 return false;
             }
             has_own = true;

@@ -27,7 +27,7 @@ pub(crate) struct Args {
     /// Times of the messages: `capture` as in their headers, so that the clock of a player and the stamps agree, or
     /// `arrival` at the recorder.
     #[arg(long, value_enum, default_value_t)]
-    times: Times,
+    times: ExportTimes,
     /// Place of the LiDAR on its vehicle, for /tf_static: metres, and optionally its yaw in degrees.
     #[arg(long, value_name = "X,Y,Z[,YAW]", allow_hyphen_values = true)]
     lidar_mount: Option<Mount>,
@@ -39,24 +39,10 @@ pub(crate) struct Args {
     json: bool,
 }
 
-/// Times of the messages in a bag.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, clap::ValueEnum)]
-enum Times {
-    /// Capture times, as in the headers.
-    #[default]
-    Capture,
-    /// Arrival at the recorder.
-    Arrival,
-}
-
 /// Writes the bag and reports what is in it.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     log_to_stderr();
-    let times = match args.times {
-        Times::Capture => ExportTimes::Capture,
-        Times::Arrival => ExportTimes::Arrival,
-    };
-    let mount = args.lidar_mount.unwrap_or_default();
+    let (times, mount) = (args.times, args.lidar_mount.unwrap_or_default());
     let report = match export_ros2(&args.from, &args.to, times, &mount, args.zstd_level) {
         Ok(report) => report,
         Err(error) => return Ok(Outcome::bad_input(&error)),
@@ -68,9 +54,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
         output::line(format_args!(
             "{messages} messages in {to}; {left_out} others have no type in ROS 2"
         ))?;
-        for damage in &report.damage {
-            output::line(damage)?;
-        }
+        report.damage.iter().try_for_each(output::line)?;
     }
     Ok(Outcome::of(!report.damage.is_empty()))
 }

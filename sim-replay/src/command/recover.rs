@@ -44,9 +44,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     } else {
         let (messages, out) = (report.messages, args.out.display());
         output::line(format_args!("{messages} messages in {out}"))?;
-        for damage in &report.damage {
-            output::line(damage)?;
-        }
+        report.damage.iter().try_for_each(output::line)?;
     }
     Ok(Outcome::of(!report.damage.is_empty()))
 }

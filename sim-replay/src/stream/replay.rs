@@ -101,31 +101,13 @@ impl StreamOptions {
 /// Reasons why a scene cannot be played.
 #[derive(Debug, thiserror::Error)]
 pub enum StreamError {
-    /// A vehicle that the scenario does not have.
-    /// The message names the scenario, the requested agent and the available ones.
+    /// The options do not fit each other or the scenario: a vehicle or tick that it does not have, an invalid rate, or a
+    /// link in lockstep, where a lost frame is never answered. The message names what was asked and what there is.
     #[error("{0}")]
-    NoAgent(String),
-    /// A tick that the scenario does not have.
-    #[error("scenario {scenario} has {ticks} ticks, counted from 0; there is no tick {asked}")]
-    NoTick {
-        /// The scenario.
-        scenario: String,
-        /// The requested tick.
-        asked: usize,
-        /// Number of ticks.
-        ticks: usize,
-    },
-    /// An invalid rate.
-    #[error("rate is {0}, not a number from 0 to 1000")]
-    Rate(f64),
+    Options(String),
     /// The link is invalid.
     #[error(transparent)]
     Link(#[from] LinkError),
-    /// A lost frame is never answered.
-    #[error(
-        "a link and lockstep exclude each other: a tick whose frames are late or lost is not answered"
-    )]
-    LinkInLockstep,
     /// The checkpoint is invalid.
     #[error("checkpoint: {0}")]
     Checkpoint(#[from] FileError),
@@ -383,7 +365,7 @@ impl<'a> Replay<'a> {
             Control::Step { ticks } => self.clock.step(ticks),
             Control::Seek { tick } => match usize::try_from(tick) {
                 Ok(index) if index < self.tick_count => {
-                    self.schedule.seek(index);
+                    self.schedule.position.next_tick = index;
                     // A jump ahead is a jump in capture time too, which would otherwise be waited out.
                     self.clock.rebase();
                     self.reading.want(&self.schedule.ahead(READ_AHEAD));
@@ -483,21 +465,19 @@ fn end_of(timeout: Duration) -> Option<Instant> {
 }
 
 fn check(scenario: &Scenario, options: &StreamOptions) -> Result<(), StreamError> {
+    let (name, ticks) = (&scenario.name, scenario.ticks.len());
+    let StreamOptions { rate, seek, .. } = options;
     // NaN lies in no range, so it is refused too.
-    if !(0.0..=1e3).contains(&options.rate) {
-        return Err(StreamError::Rate(options.rate));
-    }
-    if options.link.is_some() && !options.lockstep.is_empty() {
-        return Err(StreamError::LinkInLockstep);
-    }
-    if options.seek >= scenario.ticks.len() {
-        return Err(StreamError::NoTick {
-            scenario: scenario.name.clone(),
-            asked: options.seek,
-            ticks: scenario.ticks.len(),
-        });
-    }
-    Ok(())
+    let problem = if !(0.0..=1e3).contains(rate) {
+        format!("rate is {rate}, not a number from 0 to 1000")
+    } else if options.link.is_some() && !options.lockstep.is_empty() {
+        "a link and lockstep exclude each other: a tick whose frames are late or lost is not answered".into()
+    } else if *seek >= ticks {
+        format!("scenario {name} has {ticks} ticks, counted from 0; there is no tick {seek}")
+    } else {
+        return Ok(());
+    };
+    Err(StreamError::Options(problem))
 }
 
 fn agent_indices(scenario: &Scenario, asked: &[CavId]) -> Result<Vec<usize>, StreamError> {
@@ -511,7 +491,7 @@ fn agent_indices(scenario: &Scenario, asked: &[CavId]) -> Result<Vec<usize>, Str
             let available: Vec<&str> = agents.iter().map(CavId::as_str).collect();
             let (name, available) = (&scenario.name, available.join(", "));
             let reason = format!("scenario {name} has no agent {cav}; it has {available}");
-            StreamError::NoAgent(reason)
+            StreamError::Options(reason)
         })
     });
     indices.collect()

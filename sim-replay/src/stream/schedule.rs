@@ -65,11 +65,6 @@ impl Schedule {
         Self { position, ..self }
     }
 
-    /// Continues from tick `index` instead.
-    pub fn seek(&mut self, index: usize) {
-        self.position.next_tick = index;
-    }
-
     /// The next ticks, at most `count`.
     pub fn ahead(&self, count: usize) -> Vec<usize> {
         let ahead = self.clone().take(count);
@@ -183,13 +178,13 @@ mod tests {
             schedule.next().map(|planned| planned.capture_nanos),
             Some(100)
         );
-        schedule.seek(2);
+        schedule.position.next_tick = 2;
         assert_eq!(schedule.ahead(3), [2, 3]);
         assert_eq!(
             schedule.next().map(|planned| planned.capture_nanos),
             Some(300)
         );
-        schedule.seek(0);
+        schedule.position.next_tick = 0;
         assert_eq!(plan(schedule, 2), [(0, 400), (1, 500)]);
     }
 }

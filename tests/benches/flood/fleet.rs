@@ -170,7 +170,7 @@ pub(crate) fn run_part(arguments: &[String]) -> Result<()> {
         bail!("part NAME ENDPOINT KEYS SHM_MIB SECONDS")
     };
     let place = Place {
-        endpoint: Endpoint::new(endpoint)?,
+        endpoint: endpoint.parse()?,
         keys: (!keys.is_empty()).then(|| PathBuf::from(keys)),
         shm: match shm_mib.parse::<usize>()? {
             0 => SharedMemory::Off,

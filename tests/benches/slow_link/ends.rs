@@ -133,7 +133,7 @@ fn between(cell: &Cell, router: &Endpoint) -> Result<Measurement> {
 
 /// Routes messages until its input ends.
 pub(crate) fn route(endpoint: &str) -> Result<()> {
-    let _router = open(&BusOptions::router(Endpoint::new(endpoint)?))?;
+    let _router = open(&BusOptions::router(endpoint.parse()?))?;
     std::io::copy(&mut std::io::stdin(), &mut std::io::sink())?;
     Ok(())
 }

@@ -10,7 +10,7 @@ use std::thread;
 use std::time::Duration;
 
 use anyhow::{Context, Result, bail};
-use bus::{BusOptions, Endpoint, open};
+use bus::{BusOptions, open};
 use zenoh::{Config, Session, Wait};
 
 use super::ends::{self, Measurement};
@@ -83,7 +83,7 @@ pub(crate) fn run_end(arguments: &[String]) -> Result<()> {
             }
         }
         (false, false) => {
-            let agent = ends::join(&Endpoint::new(ROUTER)?, "agent-7", "7")?;
+            let agent = ends::join(&ROUTER.parse()?, "agent-7", "7")?;
             let submissions = ends::send(&agent, &cell, &[(ends::sent_topic(), "ego-9")])?;
             let ledger = agent.stats().ledger();
             agent.leave(Duration::from_secs(20))?;
@@ -99,8 +99,8 @@ pub(crate) fn run_end(arguments: &[String]) -> Result<()> {
 }
 
 fn ego() -> Result<Measurement> {
-    let _router = open(&BusOptions::router(Endpoint::new(ROUTER)?))?;
-    let ego = ends::join(&Endpoint::new(ROUTER)?, "ego-9", "9")?;
+    let _router = open(&BusOptions::router(ROUTER.parse()?))?;
+    let ego = ends::join(&ROUTER.parse()?, "ego-9", "9")?;
     print_ready()?;
     let arrivals = ends::receive(&ego, &ends::sent_topic())?;
     Ok(Measurement {

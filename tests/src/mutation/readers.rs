@@ -105,7 +105,7 @@ pub fn all(root: &Path) -> Vec<Reader> {
         ),
         on_disk("npy", vec![seeds::npy()], file("npy", "a.npy"), read_cloud),
         in_memory("opendrive", text(seeds::OPENDRIVE), |_, bytes| {
-            map::opendrive::read_bytes(bytes).is_ok()
+            map::opendrive::read(bytes).is_ok()
         }),
         on_disk(
             "mcap recording",

@@ -7,8 +7,7 @@ use std::time::{Duration, Instant};
 use bus::shutdown::Stop;
 use bus::{
     self, Barrier, Bus, BusConfig, BusError, BusOptions, Endpoint, Event, LivelinessEvent,
-    Overflow, Publisher, PublisherOptions, Route, SharedMemory, SharedMemoryUse,
-    bounded_queue::Pop,
+    Publisher, PublisherOptions, Route, SharedMemory, SharedMemoryUse, bounded_queue::Pop,
 };
 use protocol::{
     Account, CavId, Control, DropReason, Gnss, GnssSource, Ledger, Lidar, Limits, PointCloud, Pose,
@@ -590,7 +589,7 @@ fn shared_memory_carries_the_same_messages() {
         .publisher(
             topic.clone(),
             PublisherOptions {
-                overflow: Overflow::Wait(4),
+                waiting_places: Some(4),
                 ..PublisherOptions::SENSOR
             },
         )

@@ -52,7 +52,8 @@ fn golden_c3_anchors_full() {
         );
         let (_, first) = golden.f64(&format!("{name}.first_cell"));
         for (anchor, expected) in first.as_chunks::<7>().0.iter().enumerate() {
-            assert_close(name, &anchors.get(anchor), expected, 1e-9, 0.0);
+            let found = hwl_of_box(&anchors.box_at(anchor));
+            assert_close(name, &found, expected, 1e-9, 0.0);
         }
     }
 }
@@ -193,7 +194,8 @@ impl PostprocessCase {
         let (_, expected) = golden.f64("anchors");
         assert_eq!(expected.len(), anchors.len() * 7);
         for (index, expected) in expected.as_chunks::<7>().0.iter().enumerate() {
-            assert_close("anchor", &anchors.get(index), expected, 1e-9, 0.0);
+            let found = hwl_of_box(&anchors.box_at(index));
+            assert_close("anchor", &found, expected, 1e-9, 0.0);
         }
         let keep: [f64; 6] = array(&config["gt_range"]);
         let config = PostprocessConfig {
@@ -219,7 +221,8 @@ impl PostprocessCase {
             let (cell, anchor) = (index / per_cell, index % per_cell);
             let offsets =
                 std::array::from_fn(|component| offsets[(7 * anchor + component) * cells + cell]);
-            let code = hwl_of_box(&decode_box(offsets, self.anchors.get(index)).expect("finite"));
+            let anchor_box = self.anchors.box_at(index);
+            let code = hwl_of_box(&decode_box(offsets, &anchor_box).expect("finite"));
             let expected: [f64; 7] =
                 std::array::from_fn(|component| f64::from(all[index * 7 + component]));
             assert_close("decoded", &code, &expected, 1e-4, 0.0);

@@ -13,7 +13,7 @@ use protocol::Dtype;
 use tempfile::TempDir;
 use tests::locks::random_generator_lock;
 use tests::scene;
-use tests::training::{self, Ear};
+use tests::training::{self, EventLog};
 
 /// Holds the random number generator, and a folder with a scene of two vehicles and one tick; the path of the scene.
 fn begin() -> (MutexGuard<'static, ()>, TempDir, PathBuf) {
@@ -38,10 +38,10 @@ fn config(scene: &Path, out: &Path, method: Method, steps: u64) -> TrainConfig {
     }
 }
 
-fn run(config: &TrainConfig) -> (TrainSummary, Ear) {
-    let mut ear = Ear::default();
-    let summary = train::run(config, &mut |event| ear.hear(event)).unwrap();
-    (summary, ear)
+fn run(config: &TrainConfig) -> (TrainSummary, EventLog) {
+    let mut events = EventLog::default();
+    let summary = train::run(config, &mut |event| events.add(event)).unwrap();
+    (summary, events)
 }
 
 fn evaluate(weights: PathBuf, scene: &Path, method: Method, dtype: Dtype) -> Vec<EvaluatedFrame> {
@@ -70,13 +70,14 @@ fn a_training_that_was_interrupted_ends_like_one_that_was_not() {
     let (whole, parts) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
     // The learning rate follows the completed fraction, so an early stop is a checkpoint of the whole length.
     let uninterrupted = config(&scene, whole.path(), Method::ATTENTION, 10);
-    let (summary, ear) = run(&uninterrupted);
-    let validated = ear.validations.iter().map(|text| text.split(':').next());
+    let (summary, events) = run(&uninterrupted);
+    let validated = events.validations.iter().map(|text| text.split(':').next());
     let validated: Vec<Option<&str>> = validated.collect();
     assert_eq!(summary.trained.steps, 10);
     assert_eq!(validated, [Some("step 5"), Some("step 10")]);
     assert!(
-        ear.losses
+        events
+            .losses
             .iter()
             .all(|loss| loss.is_finite() && *loss > 0.0)
     );

@@ -24,7 +24,7 @@ use runner::experiment::table::{self, TableObserver};
 use support::file_digests::FileDigests;
 use tests::locks::random_generator_lock;
 use tests::scene;
-use tests::training::{Ear, config, small};
+use tests::training::{EventLog, config, small};
 
 const AGENTS: [&str; 3] = ["4279", "4288", "4301"];
 const TICKS: usize = 7;
@@ -133,11 +133,12 @@ fn pastat_learns_behind_a_frozen_encoder_and_is_judged_with_late_messages() {
     let folder = tempfile::tempdir().unwrap();
     let (data, init) = begin(folder.path());
     let first = pastat(folder.path(), &data, &init, "pastat");
-    let mut ear = Ear::default();
-    let summary = train::run(&first, &mut |event| ear.hear(event)).unwrap();
-    assert_eq!(ear.encoded, AGENTS.len() * TICKS, "every sweep once");
+    let mut events = EventLog::default();
+    let summary = train::run(&first, &mut |event| events.add(event)).unwrap();
+    assert_eq!(events.encoded, AGENTS.len() * TICKS, "every sweep once");
     assert!(
-        ear.losses
+        events
+            .losses
             .iter()
             .all(|loss| loss.is_finite() && *loss > 0.0)
     );
@@ -160,9 +161,9 @@ fn pastat_learns_behind_a_frozen_encoder_and_is_judged_with_late_messages() {
     );
 
     // The same again, with its maps cached: the same weights.
-    let mut again = Ear::default();
+    let mut again = EventLog::default();
     let repeated = pastat(folder.path(), &data, &init, "again");
-    let repeated = train::run(&repeated, &mut |event| again.hear(event)).unwrap();
+    let repeated = train::run(&repeated, &mut |event| again.add(event)).unwrap();
     assert_eq!(
         (again.encoded, repeated.trained.sha256),
         (0, summary.trained.sha256)

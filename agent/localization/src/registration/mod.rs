@@ -24,7 +24,6 @@ pub mod sc2pcr;
 
 mod compatibility;
 mod pairs;
-mod sampling;
 #[cfg(test)]
 pub(crate) mod test_problem;
 

@@ -5,12 +5,11 @@
 //! optimised locally. Drawing ends as soon as a better motion would have been drawn with the required confidence. Same
 //! input and seed, same result.
 
-use nalgebra::{Isometry3, Vector3};
-use rand::SeedableRng;
+use nalgebra::{Isometry3, Rotation3, UnitQuaternion, Vector3};
+use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use super::pairs::{Gain, PairColumns};
-use super::sampling::{self, SampleTest};
 use super::{Correspondence, NoRegistration, Registration, check_enough, refine};
 
 /// Scales of the local optimisation, in thresholds: wide enough for a motion from few noisy points.
@@ -21,23 +20,18 @@ const FINAL_STEPS: usize = 20;
 /// may be too close together or too noisy.
 const SAMPLE_YIELD: f64 = 0.25;
 
-/// Minimal solver: computes a motion from a sample.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub enum MinimalSolver {
-    /// From two points: heading and position of an upright vehicle; its tilt is estimated afterwards.
-    #[default]
-    UprightTwoPoint,
-    /// From three points: any rotation.
-    ThreePoint,
-}
+/// Shares of the pairs of highest weight that successive draws are taken from. Half of the draws follow the weights,
+/// half do not, so that uninformative weights cost a factor of two and no more.
+const POOLS: [f64; 4] = [0.1, 1.0, 0.3, 1.0];
+/// Fewest pairs in a pool.
+const MIN_POOL: usize = 12;
 
-/// Settings of the search.
+/// Settings of the search. A sample of two points gives heading and position of an upright vehicle; its tilt is
+/// estimated afterwards.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RansacConfig {
     /// Largest residual of an inlier, metres.
     pub inlier_threshold_m: f64,
-    /// Minimal solver.
-    pub minimal: MinimalSolver,
     /// Largest angle between both frames' upright axes, degrees; 180 allows everything.
     pub max_tilt_deg: f64,
     /// Shortest edge of a sample, metres.
@@ -61,7 +55,6 @@ impl Default for RansacConfig {
     fn default() -> Self {
         Self {
             inlier_threshold_m: 1.5,
-            minimal: MinimalSolver::UprightTwoPoint,
             max_tilt_deg: 12.0,
             min_edge_m: 6.0,
             min_inliers: 12,
@@ -75,19 +68,6 @@ impl Default for RansacConfig {
 }
 
 impl RansacConfig {
-    /// For any rotation and inliers within `inlier_threshold_m`.
-    pub fn any_rotation(inlier_threshold_m: f64) -> Self {
-        Self {
-            inlier_threshold_m,
-            minimal: MinimalSolver::ThreePoint,
-            max_tilt_deg: 180.0,
-            min_edge_m: 2.0 * inlier_threshold_m,
-            refine_scale_m: inlier_threshold_m / 1.5,
-            max_draws: 100_000,
-            ..Self::default()
-        }
-    }
-
     /// The same for correspondences with `factor` times the error.
     pub fn wider(&self, factor: f64) -> Self {
         Self {
@@ -98,15 +78,6 @@ impl RansacConfig {
         }
     }
 
-    fn sample_test(&self) -> SampleTest {
-        SampleTest {
-            min_edge_m: self.min_edge_m,
-            // Both ends of an edge may have an error of a threshold.
-            edge_tolerance_m: 2.0 * self.inlier_threshold_m,
-            max_tilt_rad: self.max_tilt_deg.to_radians(),
-        }
-    }
-
     fn allows_tilt_of(&self, motion: &Isometry3<f64>) -> bool {
         let up = motion.rotation * Vector3::z();
         up.z >= self.max_tilt_deg.to_radians().cos()
@@ -114,13 +85,9 @@ impl RansacConfig {
 
     /// Number of draws after which a motion with `inliers` of `count` would have been found.
     fn draws_needed(&self, inliers: usize, count: usize) -> u32 {
-        let sample_size = match self.minimal {
-            MinimalSolver::UprightTwoPoint => 2,
-            MinimalSolver::ThreePoint => 3,
-        };
         let ratio = inliers as f64 / count.max(1) as f64;
         // n = ln(1 - confidence) / ln(1 - hit). The clamps keep both logarithms finite and other than 0.
-        let hit = (SAMPLE_YIELD * ratio.powi(sample_size)).clamp(1e-12, 1.0 - 1e-12);
+        let hit = (SAMPLE_YIELD * ratio.powi(2)).clamp(1e-12, 1.0 - 1e-12);
         let draws = (1.0 - self.confidence).max(1e-12).ln() / (1.0 - hit).ln();
         (draws.ceil().min(f64::from(self.max_draws)) as u32).max(self.min_draws)
     }
@@ -179,17 +146,12 @@ struct RansacSearch<'a> {
 
 impl RansacSearch<'_> {
     fn run(mut self, random: &mut ChaCha8Rng) -> Option<Isometry3<f64>> {
-        let test = self.config.sample_test();
         // The best score of a motion as drawn, before any optimisation: the next draw has to exceed it.
         let mut best_drawn = Gain::default();
         let mut enough = self.config.max_draws;
         let mut draw = 0;
         while draw < enough {
-            let pairs = self.pairs;
-            let drawn = match self.config.minimal {
-                MinimalSolver::UprightTwoPoint => sampling::two_points(pairs, draw, &test, random),
-                MinimalSolver::ThreePoint => sampling::three_points(pairs, draw, &test, random),
-            };
+            let drawn = two_points(self.pairs, draw, self.config, random);
             // Inconsistent samples count as draws too: a hopeless sweep would be searched forever otherwise.
             draw += 1;
             let Some(motion) = drawn else { continue };
@@ -239,9 +201,53 @@ impl RansacSearch<'_> {
     }
 }
 
+/// Draws a motion about the vertical from two pairs, or `None` if they are inconsistent.
+fn two_points(
+    pairs: &PairColumns,
+    draw: u32,
+    config: &RansacConfig,
+    random: &mut ChaCha8Rng,
+) -> Option<Isometry3<f64>> {
+    let [a, b] = draw_distinct(pairs.count, draw, random);
+    let source = [a, b].map(|index| pairs.source(index));
+    let target = [a, b].map(|index| pairs.target(index));
+    let [from, to] = [source[1] - source[0], target[1] - target[0]];
+    // In the plane: a rotation about the vertical keeps horizontal lengths. Heights are compared below.
+    let lengths = [from.xy().norm(), to.xy().norm()];
+    // Both ends of an edge may have an error of a threshold.
+    let edge_tolerance_m = 2.0 * config.inlier_threshold_m;
+    if lengths[0] < config.min_edge_m || (lengths[0] - lengths[1]).abs() > edge_tolerance_m {
+        return None;
+    }
+    // A small tilt lifts the far end.
+    let lift_m = config.max_tilt_deg.to_radians().sin() * lengths[0];
+    if (from.z - to.z).abs() > edge_tolerance_m + lift_m {
+        return None;
+    }
+    let yaw_rad = to.y.atan2(to.x) - from.y.atan2(from.x);
+    let rotation = Rotation3::from_axis_angle(&Vector3::z_axis(), yaw_rad);
+    // It maps the centre of the source points to that of the target points.
+    let [from, to] = [source, target].map(|points| points.iter().sum::<Vector3<f64>>() / 2.0);
+    let turn = UnitQuaternion::from_rotation_matrix(&rotation);
+    Some(Isometry3::from_parts((to - rotation * from).into(), turn))
+}
+
+/// Two distinct indices below `count`; the caller ensures that there are as many.
+fn draw_distinct(count: usize, draw: u32, random: &mut ChaCha8Rng) -> [usize; 2] {
+    let share = POOLS[draw as usize % POOLS.len()];
+    let pool = ((count as f64 * share) as usize).clamp(MIN_POOL.min(count), count);
+    let first = random.random_range(0..pool);
+    loop {
+        let second = random.random_range(0..pool);
+        if second != first {
+            return [first, second];
+        }
+    }
+}
+
 #[cfg(test)]
 mod tests {
-    use nalgebra::{Translation3, UnitQuaternion};
+    use nalgebra::Translation3;
     use proptest::prelude::*;
 
     use super::*;
@@ -252,12 +258,10 @@ mod tests {
         #[test]
         fn motions_are_found_among_outliers(seed in 0_u64..1000, outliers in 0.0..0.85) {
             let problem = TestProblem { count: 600, outliers, noise_m: 0.1, ..TestProblem::default() }.drawn(seed);
-            for config in [RansacConfig::default(), RansacConfig::any_rotation(1.5)] {
-                let found = solve(&problem.pairs, &config).unwrap();
-                let (metres, degrees) = problem.error(&found.target_from_source);
-                prop_assert!(metres < 0.15 && degrees < 0.15, "{:?}: {metres} m {degrees} degrees", config.minimal);
-                prop_assert!(found.inlier_ratio > 0.95 * (1.0 - outliers) - 0.08);
-            }
+            let found = solve(&problem.pairs, &RansacConfig::default()).unwrap();
+            let (metres, degrees) = problem.error(&found.target_from_source);
+            prop_assert!(metres < 0.15 && degrees < 0.15, "{metres} m {degrees} degrees");
+            prop_assert!(found.inlier_ratio > 0.95 * (1.0 - outliers) - 0.08);
         }
 
         #[test]
@@ -275,24 +279,15 @@ mod tests {
     }
 
     #[test]
-    fn any_rotation_is_found_where_it_is_allowed() {
-        let mut problem = TestProblem {
+    fn a_tilt_beyond_the_limit_is_not_found() {
+        let problem = TestProblem {
             count: 500,
             outliers: 0.5,
             noise_m: 0.05,
-            ..TestProblem::default()
-        };
-        problem = TestProblem {
             tilt_rad: 1.5,
-            ..problem
+            ..TestProblem::default()
         }
         .drawn(11);
-        let found = solve(&problem.pairs, &RansacConfig::any_rotation(0.5)).unwrap();
-        let (metres, degrees) = problem.error(&found.target_from_source);
-        assert!(
-            metres < 0.05 && degrees < 0.05,
-            "{metres} m {degrees} degrees"
-        );
         let tilted =
             solve(&problem.pairs, &RansacConfig::default()).map(|found| found.inlier_ratio);
         assert!(
@@ -451,16 +446,42 @@ mod tests {
                 }
             })
             .collect();
+        let config = RansacConfig::default();
+        assert!(solve(&pairs, &config).map_or(true, |found| found.inlier_ratio < 0.2));
+    }
+
+    #[test]
+    fn clean_samples_fix_the_motion() {
+        let problem = TestProblem {
+            tilt_rad: 0.0,
+            ..TestProblem::default()
+        }
+        .drawn(7);
+        let mut random = ChaCha8Rng::seed_from_u64(2);
+        let pairs = PairColumns::new(&problem.pairs, &mut random);
         let config = RansacConfig {
-            minimal: MinimalSolver::ThreePoint,
+            inlier_threshold_m: 0.05,
             ..RansacConfig::default()
         };
-        assert!(solve(&pairs, &config).map_or(true, |found| found.inlier_ratio < 0.2));
-        assert!(
-            solve(&pairs, &RansacConfig::any_rotation(1.0))
-                .unwrap()
-                .inlier_ratio
-                > 0.99
-        );
+        let found: Vec<_> = (0..40)
+            .filter_map(|draw| two_points(&pairs, draw, &config, &mut random))
+            .collect();
+        assert!(found.len() > 10);
+        for motion in found {
+            let (metres, degrees) = problem.error(&pairs.to_target_frame(&motion));
+            assert!(
+                metres < 0.05 && degrees < 0.05,
+                "{metres} m {degrees} degrees"
+            );
+        }
+    }
+
+    #[test]
+    fn indices_differ_even_in_the_smallest_set() {
+        let mut random = ChaCha8Rng::seed_from_u64(2);
+        for draw in 0..100 {
+            let [a, b] = draw_distinct(2, draw, &mut random);
+            assert!(a < 2 && b < 2 && a != b);
+        }
     }
 }

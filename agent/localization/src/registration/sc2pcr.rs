@@ -17,6 +17,8 @@ use super::{Correspondence, NoRegistration, Registration, check_enough};
 const WEIGHT_EPSILON: f64 = 1e-6;
 /// Size of both consensus sets when there are fewer correspondences than the first one should hold.
 const SMALL_SET: usize = 4;
+/// Largest number of fits of the refinement; it ends as soon as the number of inliers stays the same.
+const REFINEMENT_ROUNDS: usize = 20;
 
 /// Settings; the names in brackets are those of the published implementation.
 #[derive(Debug, Clone, PartialEq)]
@@ -37,32 +39,19 @@ pub struct Sc2PcrConfig {
     pub first_set: usize,
     /// Size of its second one (`k2`).
     pub second_set: usize,
-    /// Refinement; `None` for none.
-    pub refinement: Option<Refinement>,
+    /// Largest residual of an inlier of the refinement, repeated weighted fits to the inliers; metres.
+    pub refinement_threshold_m: f64,
     /// Fewest inliers of a result.
     pub min_inliers: usize,
-}
-
-/// Repeated weighted fits to the inliers.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Refinement {
-    /// Largest residual of an inlier, metres.
-    pub threshold_m: f64,
-    /// Largest number of fits; it ends as soon as the number of inliers stays the same.
-    pub rounds: usize,
 }
 
 impl Sc2PcrConfig {
     /// The same for correspondences with `factor` times the error.
     pub fn wider(&self, factor: f64) -> Self {
-        let refinement = self.refinement.map(|refinement| Refinement {
-            threshold_m: factor * refinement.threshold_m,
-            ..refinement
-        });
         Self {
             inlier_threshold_m: factor * self.inlier_threshold_m,
             distance_threshold_m: factor * self.distance_threshold_m,
-            refinement,
+            refinement_threshold_m: factor * self.refinement_threshold_m,
             ..self.clone()
         }
     }
@@ -80,10 +69,7 @@ impl Default for Sc2PcrConfig {
             max_correspondences: 1000,
             first_set: 40,
             second_set: 20,
-            refinement: Some(Refinement {
-                threshold_m: 1.5,
-                rounds: 20,
-            }),
+            refinement_threshold_m: 1.5,
             min_inliers: 12,
         }
     }
@@ -118,10 +104,8 @@ pub fn solve(
     trusted.sort_by(|a, b| b.weight.total_cmp(&a.weight));
     trusted.truncate(config.max_correspondences.max(required));
     let found = consensus(&trusted, config)?;
-    let motion = match &config.refinement {
-        Some(refinement) => refine(&trusted, &found.target_from_source, refinement),
-        None => found.target_from_source,
-    };
+    let start = &found.target_from_source;
+    let motion = refine(&trusted, start, config.refinement_threshold_m);
     Registration::judge(correspondences, motion, config.inlier_threshold_m)
         .with_at_least(required, correspondences.len())
 }
@@ -184,11 +168,10 @@ pub fn consensus(
 pub fn refine(
     pairs: &[Correspondence],
     start: &Isometry3<f64>,
-    refinement: &Refinement,
+    threshold_m: f64,
 ) -> Isometry3<f64> {
-    let threshold_m = refinement.threshold_m;
     let (mut motion, mut previous) = (*start, 0);
-    for _ in 0..refinement.rounds {
+    for _ in 0..REFINEMENT_ROUNDS {
         let mut moments = PairMoments::default();
         let mut inliers = 0;
         for pair in pairs.iter().filter(|pair| pair.usable()) {

@@ -55,27 +55,17 @@ impl Anchors {
         self.len() == 0
     }
 
-    /// x, y, z, h, w, l, yaw of the anchor with this index: metres and radians.
-    ///
-    /// # Panics
-    /// When `index` is not below [`Self::len`].
-    pub fn get(&self, index: usize) -> [f64; 7] {
-        let (cell, anchor) = (index / self.yaws_rad.len(), index % self.yaws_rad.len());
-        let (row, column) = (cell / self.x_m.len(), cell % self.x_m.len());
-        let [l, w, h] = self.size_lwh_m;
-        let (x, y, yaw) = (self.x_m[column], self.y_m[row], self.yaws_rad[anchor]);
-        [x, y, self.z_m, h, w, l, yaw]
-    }
     /// The anchor with this index as a box.
     ///
     /// # Panics
-    /// As [`Self::get`].
+    /// When `index` is not below [`Self::len`].
     pub fn box_at(&self, index: usize) -> Box3d {
-        let [x, y, z, h, w, l, yaw] = self.get(index);
+        let (cell, anchor) = (index / self.yaws_rad.len(), index % self.yaws_rad.len());
+        let (row, column) = (cell / self.x_m.len(), cell % self.x_m.len());
         Box3d {
-            center_m: [x, y, z],
-            size_m: [l, w, h],
-            heading_rad: yaw,
+            center_m: [self.x_m[column], self.y_m[row], self.z_m],
+            size_m: self.size_lwh_m,
+            heading_rad: self.yaws_rad[anchor],
         }
     }
 }
@@ -110,10 +100,10 @@ mod tests {
     #[test]
     fn the_anchor_runs_fastest_then_the_column() {
         let anchors = Anchors::for_detector(&DetectorConfig::lean());
-        let second = anchors.get(1);
-        assert_eq!(second[..2], anchors.get(0)[..2]);
-        assert!((second[6] - std::f64::consts::FRAC_PI_2).abs() < 1e-12);
-        assert!((anchors.get(2)[0] - anchors.x_m[1]).abs() < 1e-12);
+        let [first, second, third] = [0, 1, 2].map(|index| anchors.box_at(index));
+        assert_eq!(second.center_m[..2], first.center_m[..2]);
+        assert!((second.heading_rad - std::f64::consts::FRAC_PI_2).abs() < 1e-12);
+        assert!((third.center_m[0] - anchors.x_m[1]).abs() < 1e-12);
         assert_eq!(anchors.len(), 96 * 128 * 2);
     }
 }

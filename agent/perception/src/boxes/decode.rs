@@ -74,7 +74,7 @@ pub fn decode(
             let offsets: [f32; 7] =
                 std::array::from_fn(|component| offsets[(7 * anchor + component) * cells + cell]);
             let index = cell * per_cell + anchor;
-            if let Some(box3d) = decode_box(offsets, anchors.get(index)) {
+            if let Some(box3d) = decode_box(offsets, &anchors.box_at(index)) {
                 decoded.push(Decoded {
                     anchor: index,
                     score: sigmoid(logit),
@@ -86,12 +86,12 @@ pub fn decode(
     Ok(decoded)
 }
 
-/// One box from its offsets and its anchor, both x, y, z, h, w, l, yaw; `None` when an offset is not finite.
-pub fn decode_box(offsets: [f32; 7], anchor: [f64; 7]) -> Option<Box3d> {
+/// One box from its offsets x, y, z, h, w, l, yaw and its anchor; `None` when an offset is not finite.
+pub fn decode_box(offsets: [f32; 7], anchor: &Box3d) -> Option<Box3d> {
     if offsets.iter().any(|offset| !offset.is_finite()) {
         return None;
     }
-    let [x, y, z, h, w, l, yaw] = anchor;
+    let ([x, y, z], [l, w, h]) = (anchor.center_m, anchor.size_m);
     let diagonal = (l * l + w * w).sqrt();
     let [dx, dy, dz, _, _, _, dyaw] = offsets.map(f64::from);
     Some(Box3d {
@@ -100,7 +100,7 @@ pub fn decode_box(offsets: [f32; 7], anchor: [f64; 7]) -> Option<Box3d> {
         size_m: [(5, l), (4, w), (3, h)].map(|(component, prior): (usize, f64)| {
             f64::from(offsets[component].min(MAX_LOG_SIZE)).exp() * prior
         }),
-        heading_rad: dyaw + yaw,
+        heading_rad: dyaw + anchor.heading_rad,
     })
 }
 
@@ -139,7 +139,11 @@ mod tests {
 
     #[test]
     fn offsets_scale_with_the_anchor() {
-        let anchor = [1.0, 2.0, -1.0, 1.5, 3.0, 4.0, 0.5];
+        let anchor = &Box3d {
+            center_m: [1.0, 2.0, -1.0],
+            size_m: [4.0, 3.0, 1.5],
+            heading_rad: 0.5,
+        };
         let box3d = decode_box([1.0, -1.0, 2.0, 0.0, 0.0, 2.0_f32.ln(), 0.25], anchor).unwrap();
         assert_eq!(box3d.center_m, [6.0, -3.0, 2.0]);
         assert!((box3d.size_m[0] - 8.0).abs() < 1e-6 && box3d.heading_rad == 0.75);

@@ -239,8 +239,8 @@ pub struct Column {
     /// Delay of the messages of neighbours without a link, milliseconds.
     #[serde(default)]
     pub delay_ms: u64,
-    /// Attack by neighbours; absent: none. More attackers than any scenario has neighbours are refused; the ego alone has
-    /// none.
+    /// Attack by neighbours; absent: none. More attackers than any scenario has neighbours are refused; a row
+    /// without neighbours has none.
     #[serde(default)]
     pub attack: Option<AttackConfig>,
     /// Misbehaviour detection of the ego.

@@ -61,7 +61,7 @@ impl Scenario {
         let connect = self.network.connect.iter();
         let connect = connect.map(|at| ("network.connect", at));
         for (field, text) in listen.chain(connect) {
-            let rule = match Endpoint::new(text) {
+            let rule = match text.parse::<Endpoint>() {
                 Err(_) => "must read tcp/ADDRESS:PORT or quic/ADDRESS:PORT",
                 // QUIC needs the certificates of the security section.
                 Ok(endpoint) if endpoint.is_secured() && self.security.is_none() => {

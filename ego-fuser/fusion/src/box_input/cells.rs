@@ -224,7 +224,7 @@ mod tests {
         for (index, code) in cells.code.chunks_exact(BOX_CODE).enumerate() {
             let anchor = cells.cell_of[index / 2] as usize * 2 + index % 2;
             let code = std::array::from_fn(|component| code[component]);
-            let found = decode_box(code, anchors.get(anchor)).unwrap();
+            let found = decode_box(code, &anchors.box_at(anchor)).unwrap();
             for axis in 0..3 {
                 assert!((found.center_m[axis] - placed.box3d.center_m[axis]).abs() < 1e-5);
                 assert!((found.size_m[axis] - placed.box3d.size_m[axis]).abs() < 1e-5);

@@ -361,7 +361,7 @@ fn any_cloud() -> impl Strategy<Value = Cloud> {
                         offset,
                         datatypes[index],
                     ));
-                    end = offset + Datatype::of(datatypes[index]).unwrap().size();
+                    end = offset + Datatype::from_repr(datatypes[index]).unwrap().size();
                 }
                 let point_step = end + paddings[4];
                 let value = -127_i32..=127;

@@ -60,7 +60,7 @@ pub(super) struct BagContents {
 /// True for topics of clouds and of poses.
 fn is_used(topic: &BagTopic) -> bool {
     let name = &topic.type_name;
-    *name == RosType::PointCloud2.name() || PoseType::of_name(name).is_some()
+    *name == RosType::PointCloud2.name() || name.parse::<PoseType>().is_ok()
 }
 
 impl BagContents {
@@ -120,7 +120,7 @@ impl BagContents {
     fn read(&mut self, message: BagMessage<'_>) -> Result<(), String> {
         let (topic, recorded_nanos) = (&message.topic.name, message.recorded_nanos);
         let data = message.data?;
-        if let Some(pose_type) = PoseType::of_name(&message.topic.type_name) {
+        if let Ok(pose_type) = message.topic.type_name.parse::<PoseType>() {
             let is_tf = pose_type == PoseType::TfMessage;
             for transform in pose_type.read(&data).map_err(|error| error.to_string())? {
                 self.take_transform(topic, recorded_nanos, transform, is_tf);

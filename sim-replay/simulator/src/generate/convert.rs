@@ -81,12 +81,10 @@ fn header(scenario: &Scenario, dataset: &Dataset) -> Result<SceneHeader, SynthEr
     let mut pairs = capture_nanos.windows(2);
     // Two moments within one tick would share a file name.
     if let Some(pair) = pairs.find(|pair| pair[0] / tick_nanos >= pair[1] / tick_nanos) {
-        let reason = format!(
-            "scenario {}: two moments at {} and {} ns: times do not rise",
+        return Err(SynthError::Layout(format!(
+            "of the input: scenario {}: two moments at {} and {} ns: times do not rise",
             scenario.name, pair[0], pair[1]
-        );
-        let layout = "of the input";
-        return Err(SynthError::Layout { layout, reason });
+        )));
     }
     let agents = scenario.agents.iter().map(|id| SceneAgent {
         id: id.clone(),

@@ -24,13 +24,9 @@ pub enum SynthError {
     #[error(transparent)]
     Write(FileError),
     /// A layout cannot hold a scene.
-    #[error("layout {layout}: {reason}")]
-    Layout {
-        /// The layout's name.
-        layout: &'static str,
-        /// Property of the scene that the layout cannot hold.
-        reason: String,
-    },
+    /// The message names the layout and the property of the scene.
+    #[error("layout {0}")]
+    Layout(String),
     /// An option is invalid.
     #[error(transparent)]
     Option(#[from] FieldError),

@@ -113,11 +113,6 @@ pub(crate) fn velocity_to_red(velocity_mps: f32) -> f32 {
     (velocity_mps / (2.0 * RADAR_VELOCITY_SPAN_MPS as f32) + 0.5).clamp(0.0, 1.0)
 }
 
-/// Radial velocity in metres per second from the red channel, 0..1.
-pub fn red_to_velocity(red: f32) -> f32 {
-    (red - 0.5) * 2.0 * RADAR_VELOCITY_SPAN_MPS as f32
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -175,7 +170,8 @@ mod tests {
         assert_eq!((velocity_to_red(-80.0), velocity_to_red(80.0)), (0.0, 1.0));
         for velocity in [-30.0f32, 0.0, 12.3] {
             let byte = (velocity_to_red(velocity) * 255.0).round();
-            assert!((red_to_velocity(byte / 255.0) - velocity).abs() < 0.26);
+            let read = (byte / 255.0 - 0.5) * 2.0 * RADAR_VELOCITY_SPAN_MPS as f32;
+            assert!((read - velocity).abs() < 0.26);
         }
     }
 }

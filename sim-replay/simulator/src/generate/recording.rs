@@ -99,8 +99,7 @@ pub(crate) fn record(world: &World<'_>, spec: &SceneSpec) -> Result<SceneRecordi
             break;
         }
     }
-    let (_, vehicles, frames, agents) =
-        best.ok_or_else(|| SynthError::NoRoad(world.map_model.name.clone()))?;
+    let (_, vehicles, frames, agents) = best.expect("there are attempts");
     if agents.len() < spec.agents {
         let (scenario, found, wanted) = (&spec.name, agents.len() - 1, spec.agents - 1);
         return Err(SynthError::TooFewCompanions(format!(

@@ -171,10 +171,9 @@ impl SynthScene<'_, '_> {
             let fixes = moving.map(|moving| {
                 positioning.fix(&moving.motion, moving.speed_mps, self.options.period_s)
             });
-            let cav = CavId::new(&id.to_string()).map_err(|error| SynthError::Layout {
-                layout: self.options.layout.name(),
-                reason: error.to_string(),
-            })?;
+            let layout = self.options.layout.name();
+            let cav = CavId::new(&id.to_string())
+                .map_err(|error| SynthError::Layout(format!("{layout}: {error}")))?;
             agents.push(SensingAgent {
                 vehicle,
                 id,

@@ -151,16 +151,15 @@ impl SynthScene<'_, '_> {
         noise: &dyn Fn(u64) -> u64,
     ) -> (PointCloud, Vec<SweepVariant>, Vec<u32>) {
         let sensor = vehicle.mounted(LIDAR_MOUNT_M);
-        let (ground, weather) = (&*self.world.ground, self.options.weather);
-        let sweep = bench
-            .lidar
-            .sweep(&sensor, ground, bodies, weather, noise(5));
+        let (lidar, weather) = (&mut bench.lidar, self.options.weather);
+        lidar.cast(&sensor, &*self.world.ground, bodies);
+        let sweep = lidar.sweep(&sensor, bodies, weather, noise(5));
         let (points, hits) = (sweep.points.clone(), sweep.hits.clone());
         let copies = self.options.copies.iter();
         let named = copies.filter_map(|weather| Some((*weather, weather.variant()?)));
         let variants = named.map(|(weather, name)| {
             let seed = noise(7 + weather as u64);
-            let copy = bench.lidar.again(&sensor, bodies, weather, seed);
+            let copy = lidar.sweep(&sensor, bodies, weather, seed);
             SweepVariant {
                 name: name.to_owned(),
                 points: copy.points.clone(),

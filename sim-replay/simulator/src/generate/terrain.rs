@@ -474,7 +474,8 @@ mod tests {
         let mut caster = Caster::new(pattern.clone());
         for (height, deck_z) in [(9.0, 5.0), (2.0, 5.0 - f64::from(DECK_M))] {
             let sensor = Course::still(Placement::level([0.0, 0.0, height], 0.0));
-            let image = caster.cast(&sensor, &Plane(-50.0), &bodies);
+            caster.cast(&sensor, &Plane(-50.0), &bodies);
+            let image = &caster.image;
             for channel in 0..31 {
                 let elevation = f64::from(pattern.elevation_rad(channel));
                 let at = (deck_z - height) / elevation.sin();

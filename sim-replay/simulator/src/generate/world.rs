@@ -82,12 +82,10 @@ impl From<&Solid> for SolidShape {
                 radius_m,
                 half_height_m,
             } => Convex::Cylinder {
-                center_m: [0.0; 3],
                 radius_m: radius_m as f32,
                 half_height_m: half_height_m as f32,
             },
             Shape::Ellipsoid { radii_m } => Convex::Ellipsoid {
-                center_m: [0.0; 3],
                 radii_m: radii_m.map(|radius| radius as f32),
             },
         };

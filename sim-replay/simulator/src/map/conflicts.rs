@@ -63,7 +63,7 @@ mod tests {
             [x, y, 0.0]
         });
         let mut lane = Lane::new(LaneId(id), points.collect(), 3.5, 10.0);
-        (lane.junction, lane.in_junction) = (Some(0), true);
+        lane.junction = Some(0);
         lane
     }
 

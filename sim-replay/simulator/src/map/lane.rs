@@ -40,8 +40,6 @@ pub struct Lane {
     pub left: Option<LaneId>,
     /// Neighbour to the right that leads the same way.
     pub right: Option<LaneId>,
-    /// True if it lies inside a junction.
-    pub in_junction: bool,
     /// The junction it lies in, by its place in the network.
     pub junction: Option<usize>,
     /// Lanes of the same junction that cross it or end where it ends (not those that begin together with it); give way
@@ -78,16 +76,6 @@ impl Lane {
         let index = (step as usize).min(last - 1);
         let share = step - index as f64;
         self.banks_rad[index] + share * (self.banks_rad[index + 1] - self.banks_rad[index])
-    }
-
-    /// Heading at the start, radians.
-    pub fn start_heading_rad(&self) -> f64 {
-        self.at(0.0).1
-    }
-
-    /// Heading at the end, radians.
-    pub fn end_heading_rad(&self) -> f64 {
-        self.at(self.length_m).1
     }
 
     fn step_heading_rad(&self, index: usize) -> f64 {

@@ -59,7 +59,6 @@ fn build_lane(road: &Road, origin: LaneOrigin, id: LaneId) -> Option<Lane> {
         lane.banks_rad = Vec::new();
     }
     lane.junction = road.junction;
-    lane.in_junction = road.junction.is_some();
     Some(lane)
 }
 

@@ -238,7 +238,7 @@ impl Joint {
         Self {
             beside_m: (end[0] - start[0]).hypot(end[1] - start[1]),
             step_m: (end[2] - start[2]).abs(),
-            turn_rad: wrap_angle(next.start_heading_rad() - lane.end_heading_rad()),
+            turn_rad: wrap_angle(next.at(0.0).1 - lane.at(lane.length_m).1),
             is_banked: !(lane.banks_rad.is_empty() && next.banks_rad.is_empty()),
         }
     }

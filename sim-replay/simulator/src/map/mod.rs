@@ -154,7 +154,7 @@ pub struct Map {
 /// [`FileError`] if it is not readable, or no usable OpenDRIVE map.
 pub fn read_map(path: &Path) -> Result<Map, FileError> {
     let bytes = bounded_file::read(path, opendrive::MAX_BYTES as u64).at(path)?;
-    let mut network = opendrive::read_bytes(&bytes).at(path)?;
+    let mut network = opendrive::read(&bytes).at(path)?;
     let (lanes, counts) = lane_builder::lane_graph(&network);
     network.findings.extend(counts.findings);
     Ok(Map { network, lanes })

@@ -85,7 +85,6 @@ pub struct IcpTarget {
     levels: Vec<Surfels>,
     /// Position of the first sweep: keeps numbers small far out in the world.
     origin_m: Option<Vector3<f64>>,
-    range_m: [f64; 2],
 }
 
 impl IcpTarget {
@@ -95,7 +94,6 @@ impl IcpTarget {
         Self {
             levels: levels.map(|level| Surfels::new(level.voxel_m)).collect(),
             origin_m: None,
-            range_m: RANGE_M,
         }
     }
 
@@ -113,7 +111,7 @@ impl IcpTarget {
         let sensor = target_from_sensor.translation.vector;
         // World coordinates of a map may be large: sums of their squares would lose precision.
         let shift = sensor - *self.origin_m.get_or_insert(sensor);
-        for point in within(xyzi, self.range_m) {
+        for point in within(xyzi) {
             let moved = rotation * point + shift;
             self.levels.iter_mut().for_each(|level| level.add(&moved));
         }
@@ -180,16 +178,14 @@ impl IcpSource {
     /// Decimates a sweep.
     pub fn of_sweep(xyzi: &[[f32; 4]]) -> Self {
         Self {
-            points_m: decimate(within(xyzi, RANGE_M), SOURCE_VOXEL_M),
+            points_m: decimate(within(xyzi), SOURCE_VOXEL_M),
         }
     }
 }
 
 /// Points in range.
-fn within(
-    xyzi: &[[f32; 4]],
-    [nearest_m, farthest_m]: [f64; 2],
-) -> impl Iterator<Item = Vector3<f64>> {
+fn within(xyzi: &[[f32; 4]]) -> impl Iterator<Item = Vector3<f64>> {
+    let [nearest_m, farthest_m] = RANGE_M;
     let points = xyzi
         .iter()
         .map(|[x, y, z, _]| Vector3::new(*x, *y, *z).cast());

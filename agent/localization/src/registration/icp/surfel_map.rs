@@ -19,7 +19,7 @@ use support::file_error::AtFile;
 use support::{atomic_file, bounded_file};
 
 use super::surfels::{Surfel, Surfels};
-use super::{IcpConfig, IcpLevel, IcpTarget, Plane};
+use super::{IcpConfig, IcpLevel, IcpTarget, Plane, RANGE_M};
 use crate::covariance_scale::{COVARIANCE_KEY, CovarianceScale};
 
 /// Kind of the file.
@@ -128,7 +128,7 @@ impl SurfelMap {
         let config = Config {
             voxel_m: surfels.voxel_m,
             origin_m: origin_m.into(),
-            range_m: target.range_m,
+            range_m: RANGE_M,
             place: place.to_owned(),
         };
         let bytes = encode(&config, planes.len(), [&voxels, &centres, &normals]).at(path)?;
@@ -206,7 +206,6 @@ fn decode(bytes: &[u8]) -> Result<SurfelMap, Box<dyn Error>> {
         target: IcpTarget {
             levels: vec![Surfels::of_planes(config.voxel_m, planes)],
             origin_m: Some(config.origin_m.into()),
-            range_m: config.range_m,
         },
         place: config.place,
         covariance_scale: scale,

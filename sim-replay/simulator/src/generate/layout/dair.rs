@@ -231,16 +231,15 @@ impl SceneWriter for Dair {
     fn begin(&mut self, scene: &SceneHeader) -> Result<(), SynthError> {
         let layout: &'static str = self.edition.into();
         if scene.agents.len() < 2 {
-            let reason = format!(
-                "scene {} has one agent; a vehicle and a roadside unit are needed",
+            return Err(SynthError::Layout(format!(
+                "{layout}: scene {} has one agent; a vehicle and a roadside unit are needed",
                 scene.name
-            );
-            return Err(SynthError::Layout { layout, reason });
+            )));
         }
         if self.first_frame + scene.capture_nanos.len() > FIRST_UNIT_FRAME {
-            let reason =
-                format!("more than {FIRST_UNIT_FRAME} frames have no numbers of six digits");
-            return Err(SynthError::Layout { layout, reason });
+            return Err(SynthError::Layout(format!(
+                "{layout}: more than {FIRST_UNIT_FRAME} frames have no numbers of six digits"
+            )));
         }
         if self.scene == 0 {
             self.make_folders()?;

@@ -127,7 +127,7 @@ pub(crate) struct Caster {
     cos: Vec<f32>,
     sin: Vec<f32>,
     columns: Vec<ColumnPose>,
-    /// The last sweep, as [`Caster::cast`] returned it.
+    /// The last sweep, as [`Caster::cast`] left it.
     pub(crate) image: RangeImage,
 }
 
@@ -145,12 +145,7 @@ impl Caster {
     }
 
     /// Casts one sweep: `sensor` is `world_from_sensor` over it. Bodies around the sensor itself are transparent.
-    pub(crate) fn cast(
-        &mut self,
-        sensor: &Course,
-        ground: &dyn Surface,
-        bodies: &[RayBody<'_>],
-    ) -> &RangeImage {
+    pub(crate) fn cast(&mut self, sensor: &Course, ground: &dyn Surface, bodies: &[RayBody<'_>]) {
         let anchor = sensor.end.position_m;
         let (pattern, channels) = (&self.pattern, self.pattern.channels);
         self.columns.clear();
@@ -187,7 +182,6 @@ impl Caster {
         for (footprint, body) in &order {
             self.cast_body(&bodies[*body], footprint, *body as u32, anchor);
         }
-        &self.image
     }
 
     /// The columns of the last sweep in the frame of the sensor at the sweep's end, where de-skewed points lie.

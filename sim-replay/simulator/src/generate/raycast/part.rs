@@ -17,19 +17,15 @@ pub enum Convex {
     },
     /// A box along the axes of the body.
     Box(Bounds),
-    /// An upright cylinder with its two lids.
+    /// An upright cylinder with its two lids, around the origin.
     Cylinder {
-        /// Centre.
-        center_m: [f32; 3],
         /// Radius.
         radius_m: f32,
         /// Half of the height.
         half_height_m: f32,
     },
-    /// An ellipsoid along the axes of the body.
+    /// An ellipsoid along the axes of the body, around the origin.
     Ellipsoid {
-        /// Centre.
-        center_m: [f32; 3],
         /// Radii along x, y, z.
         radii_m: [f32; 3],
     },
@@ -96,11 +92,10 @@ impl Convex {
         match self {
             Self::Hull { bounds, .. } | Self::Box(bounds) => *bounds,
             Self::Cylinder {
-                center_m,
                 radius_m,
                 half_height_m,
-            } => Bounds::centered(*center_m, [*radius_m, *radius_m, *half_height_m]),
-            Self::Ellipsoid { center_m, radii_m } => Bounds::centered(*center_m, *radii_m),
+            } => Bounds::centered([0.0; 3], [*radius_m, *radius_m, *half_height_m]),
+            Self::Ellipsoid { radii_m } => Bounds::centered([0.0; 3], *radii_m),
         }
     }
 
@@ -116,13 +111,10 @@ impl Convex {
             Self::Hull { planes, .. } => cast_hull(planes, rays, pixels),
             Self::Box(bounds) => cast_box(bounds, rays, pixels),
             Self::Cylinder {
-                center_m,
                 radius_m,
                 half_height_m,
-            } => cast_cylinder(*center_m, [*radius_m, *half_height_m], rays, pixels),
-            Self::Ellipsoid { center_m, radii_m } => {
-                cast_ellipsoid(*center_m, *radii_m, rays, pixels);
-            }
+            } => cast_cylinder([*radius_m, *half_height_m], rays, pixels),
+            Self::Ellipsoid { radii_m } => cast_ellipsoid(*radii_m, rays, pixels),
         }
     }
 }
@@ -204,13 +196,11 @@ fn cast_hull(planes: &[[f32; 4]], rays: &ColumnRays<'_>, (depth, hit, id): Pixel
 }
 
 fn cast_cylinder(
-    center: [f32; 3],
     [radius, half_height]: [f32; 2],
     rays: &ColumnRays<'_>,
     (depth, hit, id): Pixels<'_>,
 ) {
-    let o: [f32; 3] = std::array::from_fn(|axis| rays.origin[axis] - center[axis]);
-    let (h, u) = (rays.forward, rays.up);
+    let (o, h, u) = (rays.origin, rays.forward, rays.up);
     for (((cos, sin), depth), hit) in rays.cos.iter().zip(rays.sin).zip(depth).zip(hit) {
         let [dx, dy, dz] = [0, 1, 2].map(|axis| h[axis] * cos + u[axis] * sin);
         let dz = off_zero(dz);
@@ -229,14 +219,9 @@ fn cast_cylinder(
     }
 }
 
-fn cast_ellipsoid(
-    center: [f32; 3],
-    radii: [f32; 3],
-    rays: &ColumnRays<'_>,
-    (depth, hit, id): Pixels<'_>,
-) {
+fn cast_ellipsoid(radii: [f32; 3], rays: &ColumnRays<'_>, (depth, hit, id): Pixels<'_>) {
     // In the space where the ellipsoid is the unit sphere.
-    let o: [f32; 3] = std::array::from_fn(|axis| (rays.origin[axis] - center[axis]) / radii[axis]);
+    let o: [f32; 3] = std::array::from_fn(|axis| rays.origin[axis] / radii[axis]);
     let h: [f32; 3] = std::array::from_fn(|axis| rays.forward[axis] / radii[axis]);
     let u: [f32; 3] = std::array::from_fn(|axis| rays.up[axis] / radii[axis]);
     for (((cos, sin), depth), hit) in rays.cos.iter().zip(rays.sin).zip(depth).zip(hit) {

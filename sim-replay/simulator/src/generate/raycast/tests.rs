@@ -40,14 +40,10 @@ fn random_part(random: &mut SplitMix64) -> Convex {
     match random.below(4) {
         0 => Convex::Box(Bounds::centered(center, half)),
         1 => Convex::Cylinder {
-            center_m: center,
             radius_m: half[0] * 0.2,
             half_height_m: half[2],
         },
-        2 => Convex::Ellipsoid {
-            center_m: center,
-            radii_m: half,
-        },
+        2 => Convex::Ellipsoid { radii_m: half },
         _ => {
             // A box with its upper edges cut off obliquely.
             let bounds = Bounds::centered(center, half);
@@ -131,23 +127,19 @@ fn enter(part: &Convex, o: &Point3<f64>, d: &Vector3<f64>) -> Option<f64> {
             let planes: Vec<[f64; 4]> = planes.iter().map(|p| p.map(f64::from)).collect();
             clip(&planes, o, d).map(|(near, _)| near)
         }
-        Convex::Cylinder {
-            center_m, radius_m, ..
-        } => {
-            let c = center_m.map(f64::from);
-            let (x, y) = (o.x - c[0], o.y - c[1]);
+        Convex::Cylinder { radius_m, .. } => {
             let r = f64::from(*radius_m);
             let (near, far) = roots(
                 d.x * d.x + d.y * d.y,
-                x * d.x + y * d.y,
-                x * x + y * y - r * r,
+                o.x * d.x + o.y * d.y,
+                o.x * o.x + o.y * o.y - r * r,
             )?;
             let (bottom, top) = clip(&slabs(&part.bounds(), &[2]), o, d)?;
             (near.max(bottom) <= far.min(top)).then(|| near.max(bottom))
         }
-        Convex::Ellipsoid { center_m, radii_m } => {
+        Convex::Ellipsoid { radii_m } => {
             let r: Vector3<f64> = Vector3::from(*radii_m).cast();
-            let o = (o.coords - Vector3::from(*center_m).cast::<f64>()).component_div(&r);
+            let o = o.coords.component_div(&r);
             let d = d.component_div(&r);
             roots(d.dot(&d), o.dot(&d), o.dot(&o) - 1.0).map(|(near, _)| near)
         }
@@ -237,7 +229,8 @@ fn check_against_brute_force(
             .collect();
         let ground = sensor_z - 3.0;
         let expected = brute_force(&pattern, &sensor, ground, &bodies);
-        let image = caster.cast(&sensor, &Plane(ground), &bodies);
+        caster.cast(&sensor, &Plane(ground), &bodies);
+        let image = &caster.image;
         for ray in 0..expected.hits.len() {
             rays += 1;
             on_bodies += usize::from(expected.hits[ray] < GROUND);
@@ -288,11 +281,9 @@ fn bodies_around_the_sensor_do_not_hide_the_rest() {
         },
     ];
     let mut caster = Caster::new(spinning());
-    let image = caster.cast(
-        &Course::still(Placement::level([0.0, 0.0, 1.9], 0.0)),
-        &Plane(0.0),
-        &bodies,
-    );
+    let sensor = Course::still(Placement::level([0.0, 0.0, 1.9], 0.0));
+    caster.cast(&sensor, &Plane(0.0), &bodies);
+    let image = &caster.image;
     assert!(image.hits.iter().all(|&hit| hit != 0) && image.hits.contains(&1));
     // Column 180 looks straight ahead: the wall's face is 20 m away in the channel nearest to level.
     let level = 180 * 64 + 58;

@@ -40,7 +40,7 @@ impl Explorer {
             }
         }
         let is_road = lanes.iter().map(|lane| {
-            !lane.in_junction && lane.length_m >= SHORTEST_M && roads.is_endless(lane.id)
+            lane.junction.is_none() && lane.length_m >= SHORTEST_M && roads.is_endless(lane.id)
         });
         let mut explorer = Self {
             onto,

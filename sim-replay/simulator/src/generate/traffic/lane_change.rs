@@ -247,7 +247,7 @@ fn change_m(car: &Car) -> f64 {
 fn path_beside(car: &Car, side: Side, roads: &Roads<'_>) -> Option<Path> {
     let graph = roads.graph;
     let mut under = car.path.lanes_under(graph, car.half_length_m());
-    if under.any(|lane| graph.lane(lane).in_junction) {
+    if under.any(|lane| graph.lane(lane).junction.is_some()) {
         return None;
     }
     let mut left = car.path.lane();
@@ -282,5 +282,5 @@ fn lies_beside(lane: LaneId, left: LaneId, roads: &Roads<'_>) -> bool {
     let leads_on = roads.is_endless(lane) || !roads.is_endless(left);
     let is_even = (to.length_m / from.length_m - 1.0).abs() < LENGTH_SHARE;
     let is_wide = to.widths_m.iter().all(|&width_m| width_m > LEAST_WIDTH_M);
-    !to.in_junction && !from.in_junction && leads_on && is_even && is_wide
+    to.junction.is_none() && from.junction.is_none() && leads_on && is_even && is_wide
 }

@@ -90,7 +90,7 @@ impl Traffic<'_> {
             if start_m > horizon_m {
                 break;
             }
-            if !graph.lane(lane).in_junction {
+            if graph.lane(lane).junction.is_none() {
                 continue;
             }
             let exit = ahead.get(place + 1).map(|(next, _)| *next);
@@ -113,7 +113,7 @@ impl Traffic<'_> {
 
     /// True if the lane behind a junction has space for one more vehicle.
     fn has_exit_room(&self, index: usize, exit: Option<LaneId>) -> bool {
-        let Some(exit) = exit.filter(|exit| !self.roads.graph.lane(*exit).in_junction) else {
+        let Some(exit) = exit.filter(|exit| self.roads.graph.lane(*exit).junction.is_none()) else {
             return true;
         };
         let mut occupants = self.occupants[exit.0 as usize].iter();

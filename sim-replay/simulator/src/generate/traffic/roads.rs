@@ -32,10 +32,9 @@ impl<'t> Roads<'t> {
     pub(crate) fn new(graph: &'t LaneGraph) -> Self {
         let endless = endless_lanes(graph);
         let any_endless = endless.contains(&true);
-        let open = graph
-            .lanes
-            .iter()
-            .filter(|lane| !lane.in_junction && (!any_endless || endless[lane.id.0 as usize]));
+        let open = graph.lanes.iter().filter(|lane| {
+            lane.junction.is_none() && (!any_endless || endless[lane.id.0 as usize])
+        });
         let spawns = open.flat_map(spawns_of).collect();
         Self {
             graph,

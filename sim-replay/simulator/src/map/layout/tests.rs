@@ -73,7 +73,7 @@ fn check_apart(name: &str, graph: &LaneGraph) {
     let outside: Vec<_> = graph
         .lanes
         .iter()
-        .filter(|lane| !lane.in_junction)
+        .filter(|lane| lane.junction.is_none())
         .collect();
     let mut cells = std::collections::BTreeMap::<[i64; 2], Vec<(usize, [f64; 3])>>::new();
     for (index, lane) in outside.iter().enumerate() {

@@ -17,35 +17,32 @@ pub enum OpenDriveError {
     /// The file is no well-formed XML, or XML of a kind that is refused (entities, too many nodes).
     #[error("not well-formed XML: {0}")]
     Xml(String),
-    /// An element is missing, misplaced or at odds with others, or an attribute of it has an invalid value.
-    #[error("line {line}: <{element}> {problem}")]
-    Element {
-        /// Line in the file.
-        line: u32,
-        /// Name of the element.
-        element: String,
-        /// The fault; for a value its attribute, the value in the file and the valid ones.
-        problem: String,
-        /// The same as a finding tells it.
-        found: String,
-    },
+    /// The root is another element, a limit is exceeded, or no road can be read.
+    #[error(transparent)]
+    Element(#[from] ElementError),
+}
+
+/// An element is missing, misplaced or at odds with others, or an attribute of it has an invalid value.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[error("line {line}: <{element}> {problem}")]
+pub struct ElementError {
+    /// Line in the file.
+    line: u32,
+    /// Name of the element.
+    element: String,
+    /// The fault; for a value its attribute, the value in the file and the valid ones.
+    problem: String,
+    /// The same as a finding tells it.
+    found: String,
 }
 
 /// Result of reading a part of a map.
-pub(super) type Result<T> = std::result::Result<T, OpenDriveError>;
+pub(super) type Result<T, E = ElementError> = std::result::Result<T, E>;
 
-impl OpenDriveError {
+impl ElementError {
     /// Records the error as a finding: the affected part was handled by `action`.
     pub(super) fn note(&self, log: &mut FindingLog, action: &str) {
-        match self {
-            Self::TooLarge(_) | Self::Xml(_) => log.add(1, "OpenDRIVE", &self.to_string(), action),
-            Self::Element {
-                line,
-                element,
-                found,
-                ..
-            } => log.add(*line, element, found, action),
-        }
+        log.add(self.line, &self.element, &self.found, action);
     }
 }
 
@@ -212,8 +209,8 @@ impl<'a, 'input> Element<'a, 'input> {
         self.lines.line(self.node.range().start)
     }
 
-    pub(super) fn error_element(&self, problem: &str) -> OpenDriveError {
-        OpenDriveError::Element {
+    pub(super) fn error_element(&self, problem: &str) -> ElementError {
+        ElementError {
             line: self.line(),
             element: self.name().to_owned(),
             problem: problem.to_owned(),
@@ -226,9 +223,9 @@ impl<'a, 'input> Element<'a, 'input> {
         attribute: &'static str,
         value: impl ToString,
         expected: &str,
-    ) -> OpenDriveError {
+    ) -> ElementError {
         let value: String = value.to_string().chars().take(80).collect();
-        OpenDriveError::Element {
+        ElementError {
             line: self.line(),
             element: self.name().to_owned(),
             problem: format!("has {attribute}=\"{value}\"; expected {expected}"),
@@ -237,7 +234,7 @@ impl<'a, 'input> Element<'a, 'input> {
     }
 
     /// The error of an attribute that falls from one element to the next.
-    pub(super) fn error_order(&self, attribute: &'static str, value: f64) -> OpenDriveError {
+    pub(super) fn error_order(&self, attribute: &'static str, value: f64) -> ElementError {
         self.error_value(attribute, value, "the elements in rising order")
     }
 
@@ -247,7 +244,7 @@ impl<'a, 'input> Element<'a, 'input> {
         value: impl ToString,
         low: impl Display,
         high: impl Display,
-    ) -> OpenDriveError {
+    ) -> ElementError {
         self.error_value(attribute, value, &format!("a value from {low} to {high}"))
     }
 }

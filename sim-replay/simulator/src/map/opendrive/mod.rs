@@ -27,8 +27,8 @@ use std::collections::BTreeMap;
 
 use roxmltree::{Document, ParsingOptions};
 
-pub use element::OpenDriveError;
 use element::{Element, LineIndex, Result, children};
+pub use element::{ElementError, OpenDriveError};
 
 use super::finding::FindingLog;
 use super::road::{Road, RoadNetwork};
@@ -50,46 +50,26 @@ struct Ids {
     junctions: BTreeMap<String, usize>,
 }
 
-/// Reads a map from the text of its file.
-///
-/// # Errors
-/// [`OpenDriveError`] if the text is no OpenDRIVE map, exceeds a limit, or holds no road that can be read; the latter
-/// with line, element, attribute and value of the first road's fault.
-pub fn read(text: &str) -> Result<RoadNetwork> {
-    check_size(text.len())?;
-    read_text(text, FindingLog::default())
-}
-
 /// Reads a map from the bytes of its file: UTF-8, UTF-16, or the encoding that it declares.
 ///
 /// # Errors
-/// As [`read`].
-pub fn read_bytes(bytes: &[u8]) -> Result<RoadNetwork> {
-    check_size(bytes.len())?;
+/// [`OpenDriveError`] if the file is no OpenDRIVE map, exceeds a limit, or holds no road that can be read; the latter
+/// with line, element, attribute and value of the first road's fault.
+pub fn read(bytes: impl AsRef<[u8]>) -> Result<RoadNetwork, OpenDriveError> {
+    let bytes = bytes.as_ref();
+    if bytes.len() > MAX_BYTES {
+        return Err(OpenDriveError::TooLarge(bytes.len()));
+    }
     let mut log = FindingLog::default();
     let text = encoding::decode(bytes, &mut log);
-    read_text(&text, log)
-}
-
-fn check_size(bytes: usize) -> Result<()> {
-    match bytes > MAX_BYTES {
-        true => Err(OpenDriveError::TooLarge(bytes)),
-        false => Ok(()),
-    }
-}
-
-fn read_text(text: &str, mut log: FindingLog) -> Result<RoadNetwork> {
     let options = ParsingOptions {
         nodes_limit: MAX_NODES,
         ..ParsingOptions::default()
     };
-    let document = Document::parse_with_options(text, options)
+    let document = Document::parse_with_options(&text, options)
         .map_err(|error| OpenDriveError::Xml(error.to_string()))?;
-    let lines = LineIndex::new(text);
+    let lines = LineIndex::new(&text);
     let root = Element::root(document.root_element(), &lines);
-    if root.name() != "OpenDRIVE" {
-        return Err(root.error_element("is the root; expected <OpenDRIVE>"));
-    }
     children(root, "include").for_each(|element| element.note_value(&mut log, "file", "left out"));
     let (mut roads, elements) = read_roads(root, &mut log)?;
     let (junctions, junction_elements) = collect_ids(root, "junction", &mut log);
@@ -126,6 +106,9 @@ fn read_roads<'a, 'input>(
     root: Element<'a, 'input>,
     log: &mut FindingLog,
 ) -> Result<(Vec<Road>, Vec<Element<'a, 'input>>)> {
+    if root.name() != "OpenDRIVE" {
+        return Err(root.error_element("is the root; expected <OpenDRIVE>"));
+    }
     let (_, elements) = collect_ids(root, "road", log);
     if elements.is_empty() {
         return Err(root.error_element("has no <road>"));

@@ -48,7 +48,7 @@ fn an_exit_leads_on_and_off() {
     assert_eq!(inner.successors, [starting(&graph, 60.0, -1.5).id]);
     assert_eq!(outer.successors, [starting(&graph, 60.0, -4.5).id]);
     assert_eq!((inner.right, outer.left), (Some(outer.id), Some(inner.id)));
-    assert!(graph.lanes.iter().all(|lane| !lane.in_junction));
+    assert!(graph.lanes.iter().all(|lane| lane.junction.is_none()));
 }
 
 #[test]
@@ -60,7 +60,7 @@ fn a_connection_serves_traffic_of_both_directions() {
     let graph = graph(&two_way.replacen(r#"<laneLink from="-1" to="-1"/>"#, links, 1));
     let oncoming = starting(&graph, 120.0, 1.5);
     assert_eq!(oncoming.successors, [starting(&graph, 60.0, 1.5).id]);
-    assert!((oncoming.end_heading_rad().abs() - std::f64::consts::PI).abs() < 1e-9);
+    assert!((oncoming.at(oncoming.length_m).1.abs() - std::f64::consts::PI).abs() < 1e-9);
     // From the linked road's side, with the other contact, it is the same.
     let from_there = two_way.replacen(
         r#"incomingRoad="in" linkedRoad="on" contactPoint="start"><laneLink from="-1" to="-1"/>"#,
@@ -89,7 +89,7 @@ fn a_connection_without_lane_links_links_lanes_of_one_id() {
 
 #[test]
 fn a_connection_onto_a_road_that_is_not_there_is_left_out_and_named() {
-    let network = read(&EXIT.replacen(r#"linkedRoad="off""#, r#"linkedRoad="gone""#, 1)).unwrap();
+    let network = read(EXIT.replacen(r#"linkedRoad="off""#, r#"linkedRoad="gone""#, 1)).unwrap();
     assert_eq!(network.junctions[0].connections.len(), 1);
     let expected = "line 20: junction j: <connection> linkedRoad=\"gone\", expected the id of a road of this map; connection left out";
     assert_eq!(

@@ -248,7 +248,7 @@ fn files_of_every_encoding_give_the_same_map() {
         .flat_map(u16::to_be_bytes)
         .collect();
     for bytes in [latin, wide, format!("\u{feff}{named}").into_bytes()] {
-        let network = read_bytes(&bytes).unwrap();
+        let network = read(&bytes).unwrap();
         assert_eq!(
             (network.roads.len(), network.findings.len()),
             (2, 0),

@@ -161,7 +161,7 @@ fn a_lateral_profile_that_is_none_is_left_out_and_named() {
         ),
     ] {
         assert!(BANKED.contains(from));
-        let network = read(&BANKED.replacen(from, to, 1)).unwrap();
+        let network = read(BANKED.replacen(from, to, 1)).unwrap();
         assert_eq!(
             (network.roads.len(), network.findings.len()),
             (2, 1),

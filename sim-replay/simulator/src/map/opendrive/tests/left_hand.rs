@@ -61,7 +61,7 @@ fn lanes_on_the_left_lead_along_and_continue_through_the_junction() {
     for lane in &graph.lanes {
         let is_left = lane.centerline[0][1] > 0.0;
         assert!(
-            (lane.start_heading_rad().cos() - if is_left { 1.0 } else { -1.0 }).abs() < 1e-9,
+            (lane.at(0.0).1.cos() - if is_left { 1.0 } else { -1.0 }).abs() < 1e-9,
             "{lane:?}"
         );
     }
@@ -71,7 +71,7 @@ fn lanes_on_the_left_lead_along_and_continue_through_the_junction() {
         (&eastwards.successors[..], &ahead.successors[..]),
         (&[ahead.id][..], &[starting(&graph, 100.0, 1.5).id][..])
     );
-    assert!(ahead.in_junction);
+    assert!(ahead.junction.is_some());
     let westwards = starting(&graph, 180.0, -1.5);
     let back = graph.lane(westwards.successors[0]);
     assert_eq!(back.successors, [starting(&graph, 80.0, -1.5).id]);
@@ -91,11 +91,11 @@ fn the_rule_is_that_of_each_road_and_right_hand_traffic_is_the_default() {
             graph
                 .lanes
                 .iter()
-                .any(|lane| lane.centerline[0][1] < 0.0 && lane.start_heading_rad().abs() < 1e-9)
+                .any(|lane| lane.centerline[0][1] < 0.0 && lane.at(0.0).1.abs() < 1e-9)
         );
     }
     // One road of a map keeps left; its neighbour keeps right and their lanes do not meet.
-    let network = read(&SMALL.replacen(r#" name="">"#, r#" rule="LHT">"#, 1)).unwrap();
+    let network = read(SMALL.replacen(r#" name="">"#, r#" rule="LHT">"#, 1)).unwrap();
     assert_eq!(
         network
             .roads
@@ -117,7 +117,7 @@ fn a_reversed_lane_leads_against_its_side() {
     );
     let graph = graph(&text);
     let reversed = starting(&graph, 80.0, 4.5);
-    assert!((reversed.start_heading_rad().cos() + 1.0).abs() < 1e-9);
+    assert!((reversed.at(0.0).1.cos() + 1.0).abs() < 1e-9);
     assert_eq!(
         (
             reversed.left,
