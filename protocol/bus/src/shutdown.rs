@@ -1,14 +1,10 @@
 //! Shutdown on request, within a time limit.
 
-use std::io::Read;
-use std::os::unix::net::UnixStream;
 use std::sync::mpsc;
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use signal_hook::consts::{SIGINT, SIGTERM};
-use signal_hook::low_level::pipe;
 use support::sync::{lock, spawn};
 
 /// Maximum duration of a shutdown after the request: within the 5 s of a whole fleet.
@@ -91,20 +87,33 @@ impl Stop {
     /// # Errors
     /// When the signal handlers cannot be installed.
     pub fn on_signals(&self) -> std::io::Result<()> {
-        let (mut arrived, noted) = UnixStream::pair()?;
+        let runtime = tokio::runtime::Builder::new_multi_thread()
+            .worker_threads(1)
+            .enable_all()
+            .build()?;
         // Installed here, not on the thread: a failure is an error of this call.
-        for signal in [SIGINT, SIGTERM] {
-            pipe::register(signal, noted.try_clone()?)?;
-        }
+        let (mut interrupt, mut terminate) = {
+            use tokio::signal::unix::{SignalKind, signal};
+            let _inside = runtime.enter();
+            (
+                signal(SignalKind::interrupt())?,
+                signal(SignalKind::terminate())?,
+            )
+        };
         let stop = self.clone();
         spawn("signals", move || {
-            // One byte for each signal.
-            while arrived.read_exact(&mut [0]).is_ok() {
-                if stop.requested() {
-                    std::process::exit(130);
+            runtime.block_on(async {
+                loop {
+                    tokio::select! {
+                        _ = interrupt.recv() => {}
+                        _ = terminate.recv() => {}
+                    }
+                    if stop.requested() {
+                        std::process::exit(130);
+                    }
+                    stop.request();
                 }
-                stop.request();
-            }
+            });
         })?;
         Ok(())
     }
