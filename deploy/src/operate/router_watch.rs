@@ -12,6 +12,9 @@ pub(crate) const LIMIT: Duration = Duration::from_secs(2);
 /// Longest time until the clients of a replaced router are back: over QUIC they notice its end after 10 to 30 s.
 const RETURN_LIMIT: Duration = Duration::from_secs(30);
 
+/// Shortest time without a router: one that has ended is started again after 0.2 s.
+const SHORTEST: Duration = Duration::from_millis(150);
+
 /// A change of the state of the router or of the run.
 #[derive(Debug, PartialEq)]
 pub(crate) enum RouterFinding {
@@ -92,9 +95,10 @@ impl RouterWatch {
         self.judge(silence.min(reported), scorer.router_lost_since(), now)
     }
 
-    /// Takes note of an end of the router, which is started again.
-    pub(crate) fn note_restart(&mut self) {
-        self.replaced = Some(Instant::now());
+    /// Takes note of an end of the router, which is started again: it may be back before its absence is observed.
+    pub(crate) fn note_restart(&mut self, now: Instant) {
+        self.replaced = Some(now);
+        self.gone_since.get_or_insert(now);
     }
 
     /// Judges it by the time for which nothing has come through it, and since when there is no connection.
@@ -120,7 +124,7 @@ impl RouterWatch {
                 self.gone_since = Some(since);
                 "the router is gone: no message passes".to_owned()
             }
-            (Some(since), None) => {
+            (Some(since), None) if now.saturating_duration_since(since) >= SHORTEST => {
                 let outage = now.saturating_duration_since(since);
                 self.gone_since = None;
                 self.outages.add([outage]);
@@ -231,10 +235,17 @@ mod tests {
     #[test]
     fn a_router_that_ended_by_itself_is_not_replaced_once_more() {
         let mut watch = RouterWatch::new(None, true);
-        watch.note_restart();
         let now = Instant::now();
-        assert!(line(watch.judge(LIMIT + BEAT, None, now)).contains("gone"));
+        watch.note_restart(now);
+        assert_eq!(
+            watch.judge(BEAT, None, now),
+            None,
+            "its end is not seen yet"
+        );
         assert_eq!(watch.judge(2 * LIMIT, None, now + BEAT), None);
+        let back = line(watch.judge(BEAT, None, now + 3 * BEAT));
+        assert_eq!(back, "the router is back after 0.3 s");
+        assert_eq!(watch.causes(), ["router gone for 0.3 s"]);
     }
 
     #[test]

@@ -69,9 +69,10 @@ impl StatusReporter {
 
     /// Records an event; returns the failure of the process from now on, as text.
     pub fn note(&mut self, event: &ProcessEvent) -> Option<String> {
-        self.health.note(event, Instant::now());
+        let now = Instant::now();
+        self.health.note(event, now);
         if event.name == ROUTER && matches!(event.what, ProcessEventKind::Crashed { .. }) {
-            self.router.note_restart();
+            self.router.note_restart(now);
         }
         let failure = self.failures.note(event)?;
         self.health.fails(&event.name, failure);

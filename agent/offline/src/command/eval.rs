@@ -694,7 +694,8 @@ mod tests {
         let scale: CovarianceScale = stored.metadata_json(COVARIANCE_KEY).unwrap();
         assert_eq!(scale, CovarianceScale::NONE);
         // A head without factors gets none.
-        save(&head, &none, &BTreeMap::new(), Precision::Single).unwrap();
+        let other = BTreeMap::from([("seed".to_owned(), "0".to_owned())]);
+        save(&head, &none, &other, Precision::Single).unwrap();
         reset_scale(&head, &NoScale::TooFew(45)).unwrap();
         let stored = Weights::load(&head).unwrap();
         assert_eq!(stored.metadata(COVARIANCE_KEY), None);
