@@ -97,7 +97,7 @@ def test_a_recording_has_the_frames_of_the_live_run(run):
     for frame in run.recording:
         assert not frame.problems and frame.ego in frame.detections, frame
         same = live[frame.capture_time_ns]
-        assert frame.tick == same.tick and frame.agents.keys() == same.agents.keys()
+        assert frame.tick == same.tick and frame.agents.keys() == same.agents.keys(), (frame, same)
         for cav, agent in frame.agents.items():
             assert agent.points is not None and same.agents[cav].points is None
             np.testing.assert_array_equal(agent.bev.features, same.agents[cav].bev.features)
