@@ -60,7 +60,8 @@ class Run:
     def live(self) -> list[v2vloc.Frame]:
         """Frames of a fleet that answers every tick, as they arrived."""
         endpoint = free_endpoint()
-        settings = ("scene.lockstep=true", "agents.pose=recorded", f"network.listen={endpoint}")
+        # Lockstep waits for those who compute: the rate leaves time to the recorder and the two listeners.
+        settings = ("scene.lockstep=true", "scene.rate=0.4", "agents.pose=recorded", f"network.listen={endpoint}")
         command = [PROGRAMS / "v2vloc", "up", ROOT / "deploy/scenarios/demo.yaml", "--dataset", self.scene, "--name", "fleet",
                    "--runs", self.work / "runs", "--method", "max", "--record", "--json"]
         command += [word for setting in settings for word in ("--set", setting)]
