@@ -14,8 +14,8 @@ const COPY: f64 = 0.98;
 /// The same where not all cells were sent. Two vehicles reach 0.97 in their common cells, in which most have a vehicle; a
 /// copy has 0.999 even in another number format.
 const COPY_OF_CELLS: f64 = 0.995;
-/// Successive selections with fewer common cells than this multiple of what chance gives are unrelated. On those scenes, on
-/// which the sender moves by up to 1.3 m meanwhile, honest ones have 4 times what chance gives or more.
+/// Successive selections with fewer common cells than this multiple of what chance gives are unrelated. On those scenes
+/// the sender moves by up to 1.3 m between two maps, and honest selections share at least 4 times as many cells as by chance.
 const CHANCE: f64 = 2.0;
 /// They have less than this share in common, too: chance is no measure for selections of most cells.
 const SHARED: f64 = 0.15;

@@ -262,7 +262,9 @@ impl ScenarioFolder {
         let strays = keys::strays(stems)?;
         stems.retain(|stem| !strays.contains(stem));
         let strays = listed(strays);
-        let reason = format!("numbers of another size than the other frames': left out: {strays}");
+        let reason = format!(
+            "frame numbers of another order of magnitude than the others: left out: {strays}"
+        );
         Some(ReadError::malformed(&self.dir, reason))
     }
 
@@ -583,7 +585,8 @@ mod tests {
         let (frames, last, problems) = times();
         assert_eq!((frames, last, problems.len()), (20, 1900, 2));
         let problem = problems[0].to_string();
-        let end = "numbers of another size than the other frames': left out: 123456789";
+        let end =
+            "frame numbers of another order of magnitude than the others: left out: 123456789";
         assert!(problem.ends_with(end), "{problem}");
         fs::remove_file(dir.path().join("1/123456789.pcd")).unwrap();
         // As many are off the step as are on it.

@@ -8,8 +8,8 @@ use super::time_stamps::Unit;
 
 /// Least value of a whole number that is a time: nine digits.
 const LEAST_WHOLE_TIME: f64 = 1e8;
-/// Least number of names for each one that is left out as a stray. Where more differ from the others, nothing tells
-/// which of them are wrong.
+/// Least number of names for each one that is left out as a stray. Where more differ from the others, the wrong ones
+/// cannot be determined.
 pub(super) const LEAST_PER_STRAY: usize = 10;
 /// Least distance of a stray from the median, in ranges of the other numbers. Times from a start are nearer.
 const LEAST_STRAY_RANGES: f64 = 10.0;

@@ -32,7 +32,7 @@ pub(crate) static KITTI_OBJECT: LayoutRow = LayoutRow {
 
 /// Numbers after the type in a line of labels; detections have a score as well.
 const LABEL_NUMBERS: usize = 14;
-/// What separates the words of a line of labels.
+/// Separators of the fields of a line of labels.
 const BLANKS: [char; 2] = [' ', '\t'];
 /// Largest size of an object, metres.
 const MAX_SIZE_M: f64 = 100.0;
