@@ -40,6 +40,9 @@ pub struct CovarianceScale {
     /// fewer than 2,995 poses.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub bound: Option<f64>,
+    /// Confidence of the surest wrong pose of the fit: the bound is of poses above it. Absent if none was wrong.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub bound_above: Option<f64>,
 }
 
 /// Reason why no scale can be fitted.
@@ -62,12 +65,15 @@ pub struct PoseSample {
     pub covariance: [[f64; 6]; 6],
     /// Standard deviation per axis of the position at which its registration began, metres; 0 without one.
     pub start_std_m: f64,
+    /// Confidence.
+    pub sigma: f64,
 }
 
 impl PoseSample {
-    /// Sample of a pose of a sweep that was taken at `truth`; its registration began with `start_std_m`.
+    /// Sample of a pose of confidence `sigma` of a sweep that was taken at `truth`; its registration began with
+    /// `start_std_m`.
     pub fn of(
-        (pose, start_std_m): (&Isometry3<f64>, f64),
+        (pose, sigma, start_std_m): (&Isometry3<f64>, f64, f64),
         covariance: [[f64; 6]; 6],
         truth: &Isometry3<f64>,
     ) -> Self {
@@ -78,7 +84,13 @@ impl PoseSample {
             error: [off.x, off.y, off.z, turned.x, turned.y, turned.z],
             covariance,
             start_std_m,
+            sigma,
         }
+    }
+
+    /// Distance from the true position in the plane, metres.
+    pub fn off_m(&self) -> f64 {
+        self.error[0].hypot(self.error[1])
     }
 
     /// Error along an axis, standard deviations.
@@ -117,14 +129,16 @@ impl CovarianceScale {
         tilt: 1.0,
         yaw: 1.0,
         bound: None,
+        bound_above: None,
     };
 
     /// Fits the factors so that 95 % of the errors lie within the ellipse in the plane and within 1.96 standard
-    /// deviations of every other axis, and all positions within the bound.
+    /// deviations of every other axis, and within the bound all positions that are surer than any wrong one, which is
+    /// more than `wrong_m` off.
     ///
     /// # Errors
     /// [`NoScale`] of too few poses, and where errors exceed any multiple of their covariances.
-    pub fn fit(samples: &[PoseSample]) -> Result<Self, NoScale> {
+    pub fn fit(samples: &[PoseSample], wrong_m: f64) -> Result<Self, NoScale> {
         if samples.len() < MIN_POSES {
             return Err(NoScale::TooFew(samples.len()));
         }
@@ -134,19 +148,35 @@ impl CovarianceScale {
             height: axes_factor(samples, &[2]),
             tilt: axes_factor(samples, &[3, 4]),
             yaw: axes_factor(samples, &[5]),
-            bound: None,
+            ..Self::NONE
         };
         scale.check()?;
+        Ok(scale.with_bound(samples, wrong_m))
+    }
+
+    /// The scale with a bound of these poses, if they are enough.
+    fn with_bound(self, samples: &[PoseSample], wrong_m: f64) -> Self {
+        let wrong = samples.iter().filter(|sample| sample.off_m() > wrong_m);
+        let bound_above = wrong.map(|sample| sample.sigma).reduce(f64::max);
+        let scale = Self {
+            bound_above,
+            ..self
+        };
+        let sure = samples.iter().filter(|sample| scale.is_surer(sample.sigma));
         // After the factors: the bound is in scaled standard deviations.
-        let ratios = samples.iter().map(|sample| {
-            let off_m = sample.error[0].hypot(sample.error[1]);
-            off_m / bound_std_m(&scale.applied(&sample.covariance), sample.start_std_m)
+        let ratios = sure.map(|sample| {
+            let covariance = scale.applied(&sample.covariance);
+            sample.off_m() / bound_std_m(&covariance, sample.start_std_m)
         });
-        let largest = (samples.len() >= MIN_BOUND_POSES).then(|| ratios.fold(0.0, f64::max));
-        Ok(Self {
-            bound: largest.filter(|bound| *bound <= MAX_FACTOR),
-            ..scale
-        })
+        let ratios: Vec<f64> = ratios.collect();
+        let bound = ratios.iter().copied().fold(0.0, f64::max);
+        match ratios.len() >= MIN_BOUND_POSES && bound <= MAX_FACTOR {
+            true => Self {
+                bound: Some(bound),
+                ..scale
+            },
+            false => self,
+        }
     }
 
     /// Checks values from a file.
@@ -164,13 +194,19 @@ impl CovarianceScale {
             require(factor > 0.0, field, factor, "must be above 0")?;
             within(field, factor, 0.0, MAX_FACTOR)?;
         }
-        Ok(())
+        within("bound_above", self.bound_above.unwrap_or(0.0), 0.0, 1.0)
     }
 
-    /// Distance in the plane that at most one of 1,000 poses of this unscaled covariance exceeds, whose registration began
-    /// at a pose of `start_std_m` ([`PoseSample::start_std_m`]), metres; `None` where it was not fitted.
-    pub fn bound_m(&self, covariance: &[[f64; 6]; 6], start_std_m: f64) -> Option<f64> {
-        Some(self.bound? * bound_std_m(&self.applied(covariance), start_std_m))
+    /// Distance in the plane that at most one of 1,000 poses of this confidence and unscaled covariance exceeds, whose
+    /// registration began at a pose of `start_std_m` ([`PoseSample::start_std_m`]), metres; `None` where it was not
+    /// fitted, and for a pose that is no surer than a wrong one of the fit.
+    pub fn bound_m(&self, sigma: f64, covariance: &[[f64; 6]; 6], start_std_m: f64) -> Option<f64> {
+        let bound = self.bound.filter(|_| self.is_surer(sigma))?;
+        Some(bound * bound_std_m(&self.applied(covariance), start_std_m))
+    }
+
+    fn is_surer(&self, sigma: f64) -> bool {
+        self.bound_above.is_none_or(|wrong| sigma > wrong)
     }
 
     /// The scaled covariance.
@@ -230,6 +266,8 @@ mod tests {
 
     use super::*;
 
+    const WRONG_M: f64 = 3.0;
+
     /// Poses whose errors are these factors times as large as their residuals say; x and y are correlated.
     fn samples(count: usize, factors: [f64; 6], seed: u64) -> Vec<PoseSample> {
         let mut random = ChaCha8Rng::seed_from_u64(seed);
@@ -247,6 +285,7 @@ mod tests {
                     .into(),
                 covariance: covariance.data.0,
                 start_std_m: 0.0,
+                sigma: 0.9,
             }
         });
         samples.collect()
@@ -255,7 +294,7 @@ mod tests {
     #[test]
     fn a_fitted_covariance_holds_on_other_poses() {
         let factors = [3.0, 3.0, 7.0, 5.0, 5.0, 0.5];
-        let scale = CovarianceScale::fit(&samples(4000, factors, 1)).unwrap();
+        let scale = CovarianceScale::fit(&samples(4000, factors, 1), WRONG_M).unwrap();
         let fitted = [scale.planar, scale.height, scale.tilt, scale.yaw];
         for (fitted, factor) in fitted.into_iter().zip([3.0, 7.0, 5.0, 0.5]) {
             assert!((fitted / factor - 1.0).abs() < 0.1, "{fitted}, {factor}");
@@ -268,8 +307,8 @@ mod tests {
                 ..*sample
             };
             beyond += usize::from(stated.planar_deviations() > SHARE_STD[1]);
-            let off_m = sample.error[0].hypot(sample.error[1]);
-            beyond_bound += usize::from(off_m > scale.bound_m(&sample.covariance, 0.0).unwrap());
+            let bound_m = scale.bound_m(sample.sigma, &sample.covariance, 0.0);
+            beyond_bound += usize::from(sample.off_m() > bound_m.unwrap());
         }
         assert!((0.03..0.07).contains(&(beyond as f64 / 4000.0)), "{beyond}");
         assert!(beyond_bound <= 4, "{beyond_bound}");
@@ -279,44 +318,64 @@ mod tests {
     fn few_poses_fit_nothing_and_three_thousand_are_needed_for_the_bound() {
         let all = samples(2995, [2.0; 6], 3);
         assert_eq!(
-            CovarianceScale::fit(&all[..MIN_POSES - 1]),
+            CovarianceScale::fit(&all[..MIN_POSES - 1], WRONG_M),
             Err(NoScale::TooFew(49))
         );
-        assert_eq!(CovarianceScale::fit(&all[..2994]).unwrap().bound, None);
-        let scale = CovarianceScale::fit(&all).unwrap();
+        assert_eq!(
+            CovarianceScale::fit(&all[..2994], WRONG_M).unwrap().bound,
+            None
+        );
+        let scale = CovarianceScale::fit(&all, WRONG_M).unwrap();
         for sample in &all {
-            let off_m = sample.error[0].hypot(sample.error[1]);
-            let bound_m = scale.bound_m(&sample.covariance, 0.0).unwrap();
+            let bound_m = scale.bound_m(0.9, &sample.covariance, 0.0).unwrap();
             assert!(
-                off_m <= bound_m * (1.0 + 1e-9),
+                sample.off_m() <= bound_m * (1.0 + 1e-9),
                 "it is that of the worst of them"
             );
         }
         // A pose that was registered from an unsure one has a larger bound, and errors there count less.
-        let bounds_m = [0.0, 1.0].map(|start_std_m| scale.bound_m(&all[0].covariance, start_std_m));
+        let bounds_m =
+            [0.0, 1.0].map(|start_std_m| scale.bound_m(0.9, &all[0].covariance, start_std_m));
         assert!(bounds_m[1].unwrap() > scale.bound.unwrap() && bounds_m[0] < bounds_m[1]);
         let mut unsure = all.clone();
         unsure
             .iter_mut()
             .for_each(|sample| sample.start_std_m = 1.0);
-        assert!(CovarianceScale::fit(&unsure).unwrap().bound < scale.bound);
+        assert!(CovarianceScale::fit(&unsure, WRONG_M).unwrap().bound < scale.bound);
         // Singular covariances count as exceeded: a few do not matter, more than one in twenty cannot be fitted.
         let mut singular = samples(100, [2.0; 6], 3);
         singular[..4]
             .iter_mut()
             .for_each(|sample| sample.covariance = [[0.0; 6]; 6]);
-        let regular = CovarianceScale::fit(&all[..100]).unwrap();
-        assert!(CovarianceScale::fit(&singular).unwrap().planar >= regular.planar);
+        let regular = CovarianceScale::fit(&all[..100], WRONG_M).unwrap();
+        assert!(CovarianceScale::fit(&singular, WRONG_M).unwrap().planar >= regular.planar);
         singular[..9]
             .iter_mut()
             .for_each(|sample| sample.covariance = [[0.0; 6]; 6]);
-        let refused = CovarianceScale::fit(&singular).unwrap_err();
+        let refused = CovarianceScale::fit(&singular, WRONG_M).unwrap_err();
         assert!(matches!(refused, NoScale::Unbounded(_)), "{refused}");
     }
 
     #[test]
+    fn poses_that_are_no_surer_than_a_wrong_one_have_no_bound() {
+        let mut all = samples(3200, [2.0; 6], 5);
+        let unsure = all.split_at_mut(200).0;
+        unsure.iter_mut().for_each(|sample| sample.sigma = 0.7);
+        unsure[7].error[0] = 40.0;
+        let scale = CovarianceScale::fit(&all, WRONG_M).unwrap();
+        let of_sure = CovarianceScale::fit(&all[200..], WRONG_M).unwrap();
+        assert_eq!((scale.bound_above, of_sure.bound_above), (Some(0.7), None));
+        assert!((scale.bound.unwrap() / of_sure.bound.unwrap() - 1.0).abs() < 0.1);
+        let bounds = [0.7, 0.71].map(|sigma| scale.bound_m(sigma, &all[0].covariance, 0.0));
+        assert!(bounds[0].is_none() && bounds[1].is_some());
+        // Among the surest: too few are left.
+        all[3000].error[0] = 40.0;
+        assert_eq!(CovarianceScale::fit(&all, WRONG_M).unwrap().bound, None);
+    }
+
+    #[test]
     fn factors_that_no_fit_has_are_refused_by_name() {
-        let good = CovarianceScale::fit(&samples(100, [2.0; 6], 3)).unwrap();
+        let good = CovarianceScale::fit(&samples(100, [2.0; 6], 3), WRONG_M).unwrap();
         assert_eq!(good.check(), Ok(()));
         for factor in [0.0, -1.0, f64::NAN, 1e9] {
             let bad = CovarianceScale {

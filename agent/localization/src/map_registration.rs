@@ -21,7 +21,7 @@ use crate::pgc::pose_solver::FoundPose;
 use crate::pgc::{Localization, Localize, LocalizerError, LocalizerInput, stopwatch};
 use crate::registration::icp::surfel_map::SurfelMap;
 use crate::registration::icp::{IcpFit, IcpSource, MIN_POINTS, Plane, is_level, register};
-use crate::tracker::PoseMeasurement;
+use crate::tracker::unscaled_std;
 
 /// Stage of a localization.
 const REGISTER: &str = "pose register";
@@ -209,7 +209,7 @@ fn judged(
     let judged = match registered {
         Some(registered) => FoundPose {
             evidence: found.evidence,
-            start_std_m: PoseMeasurement::new(0, found).position_std_m,
+            start_std_m: unscaled_std(found)[0],
             ..registered
         },
         None if found.sigma >= SURE => return localization,

@@ -4,7 +4,7 @@ use nalgebra::Vector6;
 
 use crate::covariance_scale::{MAX_VARIANCE, scaled};
 use crate::pgc::pose_solver::FoundPose;
-use crate::tracker::PoseMeasurement;
+use crate::tracker::unscaled_std;
 
 /// Covariance of x, y, z (metres) and of rotations about the world's x, y, z (radians), row by row, in ROS's order.
 ///
@@ -22,20 +22,20 @@ pub fn position_bound_m(found: &FoundPose) -> Option<f64> {
     if found.is_registered && found.start_std_m == 0.0 {
         return None;
     }
-    scale.bound_m(&unscaled_covariance(found), found.start_std_m)
+    scale.bound_m(found.sigma, &unscaled_covariance(found), found.start_std_m)
 }
 
-/// The covariance without the fitted factors. Residuals determine its shape; its size is that of a [`PoseMeasurement`], the
+/// The covariance without the fitted factors. Residuals determine its shape; its size is that of [`unscaled_std`], the
 /// error which the fitted confidence stands for. That of a registered pose is its own.
 pub fn unscaled_covariance(found: &FoundPose) -> [[f64; 6]; 6] {
     if found.is_registered {
         return found.cell_covariance;
     }
-    let measured = PoseMeasurement::new(0, found);
+    let [position_std_m, yaw_std_rad] = unscaled_std(found);
     let shape = &found.cell_covariance;
     let variance_m2 = f64::midpoint(shape[0][0], shape[1][1]);
-    let position = (measured.position_std_m, variance_m2);
-    let rotation = (measured.yaw_std_rad, shape[5][5]);
+    let position = (position_std_m, variance_m2);
+    let rotation = (yaw_std_rad, shape[5][5]);
     // Cells that constrain nothing leave no shape to scale: their variance stays the largest.
     let [position, rotation] = [position, rotation].map(|(std, variance)| {
         if variance > 0.0 && variance < MAX_VARIANCE {
@@ -66,13 +66,13 @@ mod tests {
     fn it_is_a_covariance_of_the_size_that_the_confidence_stands_for() {
         let found = found();
         let covariance = pose_covariance(&found);
-        let measured = PoseMeasurement::new(0, &found);
+        let [position_std_m, yaw_std_rad] = unscaled_std(&found);
         let planar = f64::midpoint(covariance[0][0], covariance[1][1]);
         assert!(
-            (planar.sqrt() - measured.position_std_m).abs() < 1e-9,
+            (planar.sqrt() - position_std_m).abs() < 1e-9,
             "{covariance:?}"
         );
-        assert!((covariance[5][5].sqrt() - measured.yaw_std_rad).abs() < 1e-9);
+        assert!((covariance[5][5].sqrt() - yaw_std_rad).abs() < 1e-9);
         let matrix = Matrix6::from_fn(|row, column| covariance[row][column]);
         assert!(
             (matrix - matrix.transpose()).amax() < 1e-9
@@ -93,10 +93,7 @@ mod tests {
         let (mut found, factor) = (found(), 3.0);
         found.covariance_scale = Some(CovarianceScale {
             planar: factor,
-            height: 1.0,
-            tilt: 1.0,
-            yaw: 1.0,
-            bound: None,
+            ..CovarianceScale::NONE
         });
         let (scaled, unscaled) = (pose_covariance(&found), unscaled_covariance(&found));
         assert!((scaled[0][1] - 9.0 * unscaled[0][1]).abs() < 1e-12);
@@ -109,11 +106,8 @@ mod tests {
     fn a_registered_pose_has_a_bound_only_where_the_deviation_of_its_start_is_known() {
         let mut found = found();
         found.covariance_scale = Some(CovarianceScale {
-            planar: 1.0,
-            height: 1.0,
-            tilt: 1.0,
-            yaw: 1.0,
             bound: Some(4.0),
+            ..CovarianceScale::NONE
         });
         assert!(position_bound_m(&found).is_some());
         found.is_registered = true;

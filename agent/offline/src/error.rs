@@ -22,7 +22,7 @@ pub enum Error {
     #[error(transparent)]
     File(#[from] FileError),
     /// No folder holds a sweep with a known pose; the faults that were found in brackets.
-    #[error("no sweep with a pose in {0:?}{1}")]
+    #[error("no sweep with a pose in {folders}{1}", folders = listed(.0))]
     NoSweeps(Vec<PathBuf>, String),
     /// The input cannot be used; the text names it, and what is needed.
     #[error("{0}")]
@@ -36,6 +36,12 @@ pub enum Error {
     /// The tensor library failed.
     #[error("training: {}", first_line(.0))]
     Tensor(#[from] TchError),
+}
+
+/// Folders as one text.
+pub(crate) fn listed(folders: &[PathBuf]) -> String {
+    let folders = folders.iter().map(|folder| folder.display().to_string());
+    folders.collect::<Vec<_>>().join(", ")
 }
 
 impl Error {

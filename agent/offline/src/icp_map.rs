@@ -4,6 +4,7 @@
 //! the vehicle and a receiver has to give the start.
 
 use crate::Error;
+use crate::error::listed;
 use crate::sweep_database::{add_faults, posed, present_sweeps};
 use std::path::Path;
 use std::sync::Arc;
@@ -116,8 +117,8 @@ pub fn read_map(
     map.fit();
     match map.planes() {
         0 => Err(Error::Input(format!(
-            "{:?}: the map of {sweeps} sweeps has no plane: their points are too few or too far apart",
-            folders()
+            "{}: the map of {sweeps} sweeps has no plane: their points are too few or too far apart",
+            listed(&folders())
         ))),
         _ => Ok(map),
     }

@@ -105,11 +105,14 @@ impl Tracker {
         }
     }
 
-    /// Takes the result of an ego and returns its tracks, none without a usable pose. Where time does not advance the
-    /// scene begins again: all tracks end.
+    /// Takes the result of an ego and returns its tracks, none without a usable pose. A frame that is repeated, as a
+    /// replay that is started again does, changes nothing; where time goes back the scene begins again: all tracks end.
     pub fn follow(&mut self, capture_nanos: u64, result: &Detections) -> Tracks {
         let before = self.left_out;
-        let taken = self.take_or_begin_again(capture_nanos, &result.pose, &result.detections);
+        let taken = match self.last_nanos == Some(capture_nanos) {
+            true => usable(&result.pose).map(|pose| pose.isometry().inverse()),
+            false => self.take_or_begin_again(capture_nanos, &result.pose, &result.detections),
+        };
         let tracks = taken.map(|ego_from_world| self.reported(&ego_from_world));
         Tracks {
             ego: result.ego.clone(),
@@ -286,6 +289,12 @@ impl Tracker {
             self.tracks.push(track);
         }
     }
+}
+
+/// The pose of a vehicle, if it is one.
+fn usable(pose: &PoseEstimate) -> Option<&Pose> {
+    let pose = pose.world_from_cav()?;
+    pose.validate().is_ok().then_some(pose)
 }
 
 /// Keeps as many measurements, those of the highest scores.

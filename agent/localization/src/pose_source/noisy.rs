@@ -143,7 +143,8 @@ pub enum NoiseMode {
 }
 
 impl NoiseMode {
-    fn name(self) -> String {
+    /// Its name in scenarios and options.
+    pub fn name(self) -> String {
         self.to_possible_value()
             .map_or_else(String::new, |mode| mode.get_name().into())
     }

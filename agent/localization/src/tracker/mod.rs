@@ -15,6 +15,7 @@ use protocol::{EgoMotion, PlanarCovariance};
 
 pub use contradictions::MotionContradiction;
 pub use measurement::PoseMeasurement;
+pub(crate) use measurement::unscaled_std;
 use track::{SpeedTrust, VehicleTrack};
 use yaw_rate_trust::YawRateTrust;
 

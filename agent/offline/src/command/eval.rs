@@ -453,7 +453,7 @@ impl Args {
             .filter(|sweep| sweep.is_registered() == registered)
             .filter_map(EvaluatedSweep::pose_sample)
             .collect();
-        let scale = CovarianceScale::fit(&samples);
+        let scale = CovarianceScale::fit(&samples, BAD_M);
         // Nothing is written unless all that was asked for can be.
         if let (true, Err(reason)) = (self.fit_covariance, &scale) {
             return Err(BadInput::of(reason.clone()).into());

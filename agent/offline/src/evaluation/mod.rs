@@ -88,11 +88,8 @@ impl EvaluatedSweep {
         let found = self.localization.found.filter(|found| !found.is_rejected)?;
         let covariance = Some(unscaled_covariance(&found));
         let covariance = covariance.filter(|covariance| covariance[0][0] < MAX_VARIANCE)?;
-        Some(PoseSample::of(
-            (&found.world_from_sensor, found.start_std_m),
-            covariance,
-            &self.truth.isometry(),
-        ))
+        let pose = (&found.world_from_sensor, found.sigma, found.start_std_m);
+        Some(PoseSample::of(pose, covariance, &self.truth.isometry()))
     }
 
     /// The same with the covariance that is published.
@@ -106,8 +103,7 @@ impl EvaluatedSweep {
     /// it has one.
     fn bounded_error(&self) -> Option<(f64, f64)> {
         let bound_m = position_bound_m(&self.localization.found?)?;
-        let [x, y, ..] = self.pose_sample()?.error;
-        Some((x.hypot(y), bound_m))
+        Some((self.pose_sample()?.off_m(), bound_m))
     }
 
     /// Applies another confidence model to the estimated pose.

@@ -26,7 +26,7 @@ use crate::training::{
 use crate::{Error, Result};
 use localization::covariance_scale::{COVARIANCE_KEY, CovarianceScale};
 use localization::pgc::confidence::{
-    CONFIDENCE_KEY, Confidence, ConfidenceModel, FitReport, Rejection,
+    BAD_M, CONFIDENCE_KEY, Confidence, ConfidenceModel, FitReport, Rejection,
 };
 use localization::pgc::head_files::ENCODER_FILE;
 use localization::pgc::{CellEncoder, Localizer};
@@ -409,7 +409,7 @@ impl MapMaking<'_> {
             sweep.judge_again(&confidence);
             samples.extend(sweep.pose_sample());
         }
-        match CovarianceScale::fit(&samples) {
+        match CovarianceScale::fit(&samples, BAD_M) {
             Ok(scale) => {
                 let text = serde_json::to_string(&scale).expect("a scale is numbers");
                 sha256 = annotate(weights, COVARIANCE_KEY, &text)?;

@@ -307,14 +307,19 @@ fn results_are_followed_through_frames_without_pose_and_scenes_that_begin_again(
         (2, &unposed),
         (3, &posed),
         (3, &posed),
+        (3, &unposed),
         (2, &posed),
     ];
     let found = found.map(|(tick, result)| tracker.follow(tick * TICK_NANOS, result));
     assert_eq!(
         found.clone().map(|frame| ids(&frame.tracks)),
-        [vec![1], vec![], vec![1], vec![2], vec![3]]
+        [vec![1], vec![], vec![1], vec![1], vec![], vec![2]],
+        "a repeated frame changes nothing, an earlier one ends all tracks"
     );
-    assert_eq!(found.clone().map(|frame| frame.left_out), [1, 0, 1, 1, 1]);
+    assert_eq!(
+        found.clone().map(|frame| frame.left_out),
+        [1, 0, 1, 0, 0, 1]
+    );
     assert_eq!((found[2].agent_frame, found[1].pose), (4, unposed.pose));
 }
 

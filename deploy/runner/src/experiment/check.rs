@@ -72,7 +72,7 @@ fn check_used(experiment: &Experiment) -> Result<()> {
     ensure!(
         mode == NoiseMode::default() || (has_axis && mode != NoiseMode::Replayed),
         "noise_mode is {}, but it is for grid.pose_noise, without a table of errors: name it in poses instead",
-        format!("{mode:?}").to_lowercase()
+        mode.name()
     );
     let is_timed = experiment.link().is_some();
     ensure!(
