@@ -163,7 +163,8 @@ impl<'a> AgentNode<'a> {
             return;
         };
         match stream {
-            Stream::Lidar if !self.options.keeps_running => self.handle(LoopInput::Ended),
+            Stream::Lidar if self.options.keeps_running => self.handle(LoopInput::SceneEnded),
+            Stream::Lidar => self.handle(LoopInput::Ended),
             Stream::Pace => self.handle(LoopInput::PaceEnded(cav.clone())),
             _ => {}
         }

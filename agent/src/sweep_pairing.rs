@@ -33,8 +33,8 @@ pub(crate) struct SweepPairing<S> {
     timeout_nanos: u64,
     /// Capture time, the sweep, and the time since which it waits, nanoseconds.
     waiting: Option<(u64, S, u64)>,
-    poses: CaptureBuffer<Pose>,
-    motions: CaptureBuffer<EgoMotion>,
+    pub(crate) poses: CaptureBuffer<Pose>,
+    pub(crate) motions: CaptureBuffer<EgoMotion>,
 }
 
 impl<S> SweepPairing<S> {
@@ -46,17 +46,6 @@ impl<S> SweepPairing<S> {
             poses: CaptureBuffer::new(),
             motions: CaptureBuffer::new(),
         }
-    }
-
-    /// Adds a pose. Returns how many others were dropped: the oldest if there are too many, and those of later sweeps.
-    /// Poses arrive in order, so a later one is left over from before the scene restarted.
-    pub(crate) fn add_pose(&mut self, capture_nanos: u64, pose: Pose) -> usize {
-        self.poses.add(capture_nanos, pose)
-    }
-
-    /// Adds a motion. Returns as [`Self::add_pose`].
-    pub(crate) fn add_motion(&mut self, capture_nanos: u64, motion: EgoMotion) -> usize {
-        self.motions.add(capture_nanos, motion)
     }
 
     /// Adds a sweep. Returns the one that it replaces.
@@ -98,7 +87,7 @@ impl<S> SweepPairing<S> {
 
 /// Measurements of one sensor by capture time.
 #[derive(Debug)]
-struct CaptureBuffer<T> {
+pub(crate) struct CaptureBuffer<T> {
     measurements: BTreeMap<u64, T>,
     /// False once a sweep had to do without one, until one arrives.
     is_expected: bool,
@@ -112,8 +101,9 @@ impl<T> CaptureBuffer<T> {
         }
     }
 
-    /// Adds a measurement; returns how many others were dropped.
-    fn add(&mut self, capture_nanos: u64, measurement: T) -> usize {
+    /// Adds a measurement. Returns how many others were dropped: the oldest if there are too many, and those of later
+    /// sweeps. Measurements arrive in order, so a later one is left over from before the scene restarted.
+    pub(crate) fn add(&mut self, capture_nanos: u64, measurement: T) -> usize {
         self.is_expected = true;
         let left_over = self.take_later(capture_nanos).len();
         let replaced = self.measurements.insert(capture_nanos, measurement);
@@ -192,12 +182,12 @@ mod tests {
     #[test]
     fn a_sweep_is_paired_with_its_pose_in_either_order() {
         let (mut pairing, now) = (without_motion(), NOW);
-        assert_eq!(pairing.add_pose(10, at(1.0)), 0);
+        assert_eq!(pairing.poses.add(10, at(1.0)), 0);
         assert_eq!(pairing.add_sweep(10, 'a', now), None);
         assert_eq!(paired(&mut pairing, now), Some((10, 'a', Some(1.0), 0)));
         assert_eq!(pairing.add_sweep(20, 'b', now), None);
         assert_eq!(paired(&mut pairing, now), None);
-        assert_eq!(pairing.add_pose(20, at(2.0)), 0);
+        assert_eq!(pairing.poses.add(20, at(2.0)), 0);
         assert_eq!(paired(&mut pairing, now), Some((20, 'b', Some(2.0), 0)));
     }
 
@@ -219,7 +209,7 @@ mod tests {
     fn a_lost_pose_is_noticed_by_the_next_or_by_the_time() {
         let (mut pairing, now) = (without_motion(), NOW);
         assert_eq!(pairing.add_sweep(10, 'a', now), None);
-        assert_eq!(pairing.add_pose(20, at(2.0)), 0);
+        assert_eq!(pairing.poses.add(20, at(2.0)), 0);
         assert_eq!(paired(&mut pairing, now), Some((10, 'a', None, 0)));
         assert_eq!(pairing.add_sweep(30, 'c', now), None);
         assert_eq!(paired(&mut pairing, now), None);
@@ -235,21 +225,21 @@ mod tests {
     fn a_restarted_scene_is_not_mistaken_for_one_with_lost_poses() {
         let (mut pairing, now) = (without_motion(), NOW);
         assert_eq!(
-            pairing.add_pose(90, at(9.0)) + pairing.add_pose(100, at(10.0)),
+            pairing.poses.add(90, at(9.0)) + pairing.poses.add(100, at(10.0)),
             0
         );
         assert_eq!(
-            pairing.add_pose(10, at(1.0)),
+            pairing.poses.add(10, at(1.0)),
             2,
             "those of the old scene are dropped and counted"
         );
         assert_eq!(pairing.add_sweep(20, 'b', now), None);
         assert_eq!(paired(&mut pairing, now), None, "its own may still arrive");
-        assert_eq!(pairing.add_pose(20, at(2.0)), 0);
+        assert_eq!(pairing.poses.add(20, at(2.0)), 0);
         assert_eq!(paired(&mut pairing, now), Some((20, 'b', Some(2.0), 1)));
-        assert_eq!(pairing.add_pose(30, at(3.0)), 0);
+        assert_eq!(pairing.poses.add(30, at(3.0)), 0);
         assert_eq!(
-            pairing.add_pose(30, at(4.0)),
+            pairing.poses.add(30, at(4.0)),
             1,
             "nor is one of the same time lost silently"
         );
@@ -259,7 +249,7 @@ mod tests {
     fn the_largest_capture_time_has_no_later_poses() {
         let (mut pairing, now) = (without_motion(), NOW);
         assert_eq!(
-            pairing.add_pose(10, at(1.0)) + pairing.add_pose(u64::MAX, at(2.0)),
+            pairing.poses.add(10, at(1.0)) + pairing.poses.add(u64::MAX, at(2.0)),
             0
         );
         assert_eq!(pairing.add_sweep(u64::MAX, 'z', now), None);
@@ -276,7 +266,7 @@ mod tests {
         let (mut pairing, now) = (without_motion(), NOW);
         assert_eq!(pairing.add_sweep(10, 'a', now), None);
         assert_eq!(pairing.add_sweep(20, 'b', now), Some('a'));
-        let gone: usize = (0..40).map(|k| pairing.add_pose(100 + k, at(0.0))).sum();
+        let gone: usize = (0..40).map(|k| pairing.poses.add(100 + k, at(0.0))).sum();
         assert_eq!(gone, 40 - MAX_MEASUREMENTS);
     }
 
@@ -291,13 +281,13 @@ mod tests {
         );
         assert_eq!(pairing.add_sweep(20, 'b', now), None);
         assert_eq!(paired(&mut pairing, now), Some((20, 'b', None, 0)));
-        assert_eq!(pairing.add_pose(30, at(3.0)), 0);
+        assert_eq!(pairing.poses.add(30, at(3.0)), 0);
         assert_eq!(pairing.add_sweep(40, 'c', now), None);
         assert_eq!(paired(&mut pairing, now), None, "there is one now");
     }
 
     fn add_sweep_with_pose(pairing: &mut SweepPairing<char>, capture_nanos: u64) {
-        assert_eq!(pairing.add_pose(capture_nanos, at(1.0)), 0);
+        assert_eq!(pairing.poses.add(capture_nanos, at(1.0)), 0);
         assert_eq!(pairing.add_sweep(capture_nanos, 'a', NOW), None);
     }
 
@@ -314,7 +304,7 @@ mod tests {
         add_sweep_with_pose(&mut pairing, 12);
         assert_eq!(pairing.next(now).unwrap().motion, None, "there is none");
         assert_eq!(
-            pairing.add_motion(15, slow) + pairing.add_motion(20, fast),
+            pairing.motions.add(15, slow) + pairing.motions.add(20, fast),
             0
         );
         add_sweep_with_pose(&mut pairing, 20);

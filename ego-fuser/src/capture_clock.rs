@@ -19,6 +19,9 @@ const UNSTEADY_NANOS: i64 = 500_000_000;
 const WINDOW_NANOS: u64 = 1_300_000_000;
 /// Time in which sweeps that waited during a pause of the ego's own agent arrive after it, nanoseconds.
 const BACKLOG_NANOS: u64 = 500_000_000;
+/// Step between capture times of own sweeps beyond which the scene has jumped, nanoseconds: a replay that jumps back leaves
+/// a gap of 61 s.
+const JUMP_NANOS: u64 = 30_000_000_000;
 /// Largest number of sweeps and of samples that are kept of a vehicle.
 const MAX_KEPT: usize = 64;
 /// Largest number of vehicles.
@@ -77,6 +80,9 @@ impl CaptureClocks {
             Some(last) if last.arrived_nanos == sweep.arrived_nanos => return,
             // The system clock was set back.
             Some(last) if last.arrived_nanos > sweep.arrived_nanos => self.own.clear(),
+            Some(last) if last.capture_nanos.abs_diff(sweep.capture_nanos) > JUMP_NANOS => {
+                self.own.clear();
+            }
             // Neighbours' sweeps of a pause cannot be compared, nor those beside own ones that waited.
             Some(last) if self.is_pause(last, &sweep) => {
                 self.own.clear();
@@ -363,6 +369,28 @@ mod tests {
             assert_eq!(clocks.corrected(&cav, 5), Some(5), "sweep {tick}");
         }
         assert_eq!(clocks.neighbours[&cav].samples.len(), 14, "dated again");
+    }
+
+    #[test]
+    fn a_lap_of_the_scene_changes_no_offset() {
+        let mut clocks = CaptureClocks::new(false);
+        let cav = CavId::new("9").unwrap();
+        for tick in 0..80 {
+            let mut own = sweep(tick, 0);
+            own.capture_nanos += tick / 40 * 61_000 * MS;
+            clocks.note_own(own);
+            clocks.note(
+                &cav,
+                SweepTime {
+                    capture_nanos: own.capture_nanos + 200 * MS,
+                    arrived_nanos: own.arrived_nanos - 5 * MS,
+                },
+            );
+            clocks.update();
+            if tick > 4 {
+                assert_eq!(clocks.corrected(&cav, 1000 * MS), Some(795 * MS), "{tick}");
+            }
+        }
     }
 
     #[test]

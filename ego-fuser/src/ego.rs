@@ -19,6 +19,7 @@ use perception::weights::Weights;
 use protocol::{
     CavId, DecodedFeatures, Detection, DropReason, PointCloud, Pose, PoseEstimate, StageTiming,
 };
+use support::file_error::AtFile;
 use support::stage_times::StageTimes;
 use tch::{Device, Kind, Tensor, no_grad};
 
@@ -29,7 +30,7 @@ use fusion::box_input::{PlacedBox, placed};
 use fusion::f64_tensor::{as_batch, one_after_another};
 use fusion::history::{History, KeptMap};
 use fusion::method::{Exchange, Method};
-use fusion::model::{FusionStage, StageError};
+use fusion::model::FusionStage;
 use fusion::points::merge_points;
 use fusion::{AlignedMaps, MapMetadata, ReceivedMaps};
 
@@ -113,10 +114,10 @@ impl Ego {
     /// The pipeline of a method around a detector, with an untrained fusion and unmixed channels of neighbours.
     ///
     /// # Errors
-    /// [`EgoError::Fusion`] when no fusion can be built behind the detector.
+    /// [`EgoError`] when no fusion can be built behind the detector.
     pub fn new(detector: Detector, method: Method) -> Result<Self, EgoError> {
         let fusion = FusionStage::untrained(method, detector.config(), detector.device())
-            .map_err(StageError::from)?;
+            .at(Path::new("untrained network"))?;
         Ok(Self::assembled(detector, method, fusion))
     }
 
@@ -125,7 +126,7 @@ impl Ego {
         Self {
             method,
             limits: PostprocessConfig::for_detector(detector.config()),
-            history: History::new(fusion.requirements().history.frames),
+            history: History::new(fusion.requirements.history.frames),
             detector,
             fusion,
             trust: None,
@@ -187,9 +188,8 @@ impl Ego {
     pub fn forget(&mut self) {
         self.history.clear();
         self.trust.iter_mut().for_each(MisbehaviourDetector::clear);
-        self.compensation
-            .iter_mut()
-            .for_each(LatencyCompensation::clear);
+        let is_compensated = self.compensation.is_some();
+        self.compensation = is_compensated.then(LatencyCompensation::default);
     }
 
     /// Detects once without real data, so that the first frame does not wait for the tensor library's preparations.
@@ -243,8 +243,8 @@ impl Ego {
         let needed = self.method.own_content();
         let (method, found) = (self.method, own.content.exchange());
         if found != needed {
-            let problem = format!("{method} needs the ego's own {needed:?}, not {found:?}");
-            return Err(EgoError::OwnContent(problem));
+            let problem = format!("method {method} needs the ego's own {needed:?}, not {found:?}");
+            return Err(EgoError::OwnView(problem));
         }
         self.history.advance(own.capture_nanos);
         if let Some(compensation) = &mut self.compensation {
@@ -272,7 +272,7 @@ impl Ego {
             stages.lap("trust");
         }
         let compensation = self.compensation.as_mut();
-        let refused_velocities = compensation.map_or(0, LatencyCompensation::take_refused);
+        let refused_velocities = compensation.map_or(0, |one| std::mem::take(&mut one.refused));
         let mut own_boxes = 0;
         if self.compensation.is_some() {
             own_boxes = no_grad(|| self.correct_poses_of_boxes(&mut chosen.aligned, &mut stages))?;
@@ -406,7 +406,7 @@ impl Ego {
         let numbered = aligned.iter().enumerate();
         let metadata = numbered.map(|(agent, view)| view.metadata(agent, aligned[0].view));
         let mut metadata: Vec<MapMetadata> = metadata.collect();
-        if let Some(pose_graph) = &self.fusion.requirements().pose_graph {
+        if let Some(pose_graph) = &self.fusion.requirements.pose_graph {
             box_correction::correct_by_boxes(&mut metadata, &maps, &self.detector, pose_graph)?;
             stages.lap("correct");
         }
@@ -448,8 +448,8 @@ impl Ego {
         let [channels, height, width] = self.detector.sent_shape();
         if !self.is_own_shape(map) {
             let (found, own) = (&map.features, self.detector.grid());
-            return Err(EgoError::OwnMap(format!(
-                "{} x {}, the network's is {channels} x {own}",
+            return Err(EgoError::OwnView(format!(
+                "the ego's own map is {} x {}, the network's is {channels} x {own}",
                 found.channels, found.grid
             )));
         }
@@ -493,7 +493,7 @@ impl Ego {
         maps: impl Iterator<Item = (Tensor, Tensor)>,
         on_grid: &AlignedMaps,
     ) -> Result<(), EgoError> {
-        if self.fusion.requirements().history.frames < 2 {
+        if self.fusion.requirements.history.frames < 2 {
             return Ok(());
         }
         for ((Aligned { view, .. }, (map, sent)), index) in aligned.iter().zip(maps).zip(0..) {

@@ -108,9 +108,7 @@ pub fn run(
     node.receive(stop)?;
     node.pace.finish();
     node.detections.finish();
-    if let Some(tracks) = node.tracks {
-        tracks.finish();
-    }
+    node.tracks.into_iter().for_each(Results::finish);
     presence.withdraw()?;
     Ok(node.ego_loop.report().clone())
 }
@@ -252,7 +250,8 @@ impl<'a> EgoNode<'a> {
             // After each message: frames that wait in the loop would be one more queue behind the inbox.
             self.handle(Input::Wake);
             // What the ego waits for is reported with the counters of the process.
-            let problems = self.ego_loop.problems(self.clock.now_nanos()).into_iter();
+            let problems = self.ego_loop.waits.problems(self.clock.now_nanos());
+            let problems = problems.into_iter();
             let problems = problems.map(|(problem, since)| (problem, self.clock.moment(since)));
             self.bus.stats().set_problems("ego", problems);
         }
@@ -414,7 +413,7 @@ impl<'a> EgoNode<'a> {
 
     /// Counts that a message was used, or why not.
     fn account(&mut self, (cav, stream): &Source, reason: Option<DropReason>, now_nanos: u64) {
-        self.ego_loop.note_use(cav, reason, now_nanos);
+        self.ego_loop.waits.note(cav, reason, now_nanos);
         let topic = topic_of(&self.cav, cav, *stream, self.options.over_link);
         match reason {
             Some(reason) => self.bus.stats().dropped(&topic, reason),

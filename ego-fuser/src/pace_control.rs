@@ -8,6 +8,8 @@ use std::collections::VecDeque;
 
 use protocol::Pace;
 
+/// Shortest intervals whose longest is the period: fewer are odd steps of a recording or of a sensor.
+const SHORTEST: usize = 3;
 /// Number of frames that are judged together.
 const WINDOW: usize = 10;
 /// Overloaded frames among them that lower the share.
@@ -27,32 +29,26 @@ const CALM_NANOS: [u64; 2] = [5_000_000_000, 80_000_000_000];
 /// Controller of an ego's pace.
 #[derive(Debug)]
 pub(crate) struct PaceControl {
-    /// Shortest interval between two sweeps of the own agent so far, nanoseconds.
-    period_nanos: Option<u64>,
+    /// The [`SHORTEST`] intervals between two sweeps of the own agent so far, nanoseconds, ascending.
+    shortest_nanos: Vec<u64>,
     pace: Pace,
     /// Time at which the pace was published, nanoseconds.
     published_nanos: Option<u64>,
     last_nanos: Option<u64>,
-    judged: VecDeque<PacedFrame>,
+    /// The frames since the last change, each with the capture time since the frame before, nanoseconds, and whether
+    /// it was overloaded.
+    judged: VecDeque<(u64, bool)>,
     /// Time of the last overloaded frame or change, nanoseconds.
     quiet_since_nanos: u64,
     raised_at_nanos: Option<u64>,
     calm_nanos: u64,
 }
 
-/// A frame since the last change.
-#[derive(Debug)]
-struct PacedFrame {
-    /// Capture time since the frame before, nanoseconds.
-    gap_nanos: u64,
-    is_overloaded: bool,
-}
-
 impl PaceControl {
     /// Controller that begins with every sweep.
     pub(crate) fn new() -> Self {
         Self {
-            period_nanos: None,
+            shortest_nanos: Vec::new(),
             pace: Pace::EVERY_SWEEP,
             published_nanos: None,
             last_nanos: None,
@@ -74,8 +70,10 @@ impl PaceControl {
         // The first frame, or one of a scene that has restarted.
         let last_nanos = last_nanos.filter(|last| *last < capture_nanos)?;
         let gap_nanos = capture_nanos - last_nanos;
-        let period_nanos = self.period_nanos.unwrap_or(gap_nanos).min(gap_nanos);
-        self.period_nanos = Some(period_nanos);
+        self.shortest_nanos.push(gap_nanos);
+        self.shortest_nanos.sort_unstable();
+        self.shortest_nanos.truncate(SHORTEST);
+        let period_nanos = *self.shortest_nanos.last()?;
         let intervals = [capture_nanos, last_nanos].map(|nanos| self.pace.interval_of(nanos));
         // Agents compute one sweep of each interval, so that a skipped interval is a sweep left out.
         // At every sweep there are no intervals: a gap of one and a half periods is one.
@@ -90,10 +88,7 @@ impl PaceControl {
         if is_overloaded {
             self.quiet_since_nanos = now_nanos;
         }
-        self.judged.push_back(PacedFrame {
-            gap_nanos,
-            is_overloaded,
-        });
+        self.judged.push_back((gap_nanos, is_overloaded));
         if self.judged.len() > WINDOW {
             self.judged.pop_front();
         }
@@ -133,7 +128,7 @@ impl PaceControl {
     /// Another share, tenths, if it is time for one.
     fn next_share(&mut self, period_nanos: u64, now_nanos: u64) -> Option<u8> {
         let share = self.pace.computed * (TENTHS / self.pace.of);
-        let overloaded = self.judged.iter().filter(|frame| frame.is_overloaded);
+        let overloaded = self.judged.iter().filter(|frame| frame.1);
         let count = overloaded.count();
         // Tenths at which computed sweeps are MAX_INTERVAL_NANOS apart on average.
         let lowest = period_nanos.saturating_mul(u64::from(TENTHS)) / MAX_INTERVAL_NANOS;
@@ -159,7 +154,7 @@ impl PaceControl {
 
     /// Share of the sweeps that were computed since the last change, whole tenths.
     fn achieved_share(&self, period_nanos: u64) -> u8 {
-        let span_nanos: u64 = self.judged.iter().map(|frame| frame.gap_nanos).sum();
+        let span_nanos: u64 = self.judged.iter().map(|(gap, _)| gap).sum();
         let frames = self.judged.len() as u64;
         let share = (u64::from(TENTHS) * frames).saturating_mul(period_nanos) / span_nanos.max(1);
         u8::try_from(share).unwrap_or(TENTHS)
@@ -258,6 +253,16 @@ mod tests {
             let now = sweep * SWEEP_NANOS;
             let waited = nanos(if sweep % 6 == 0 { 60 } else { 40 });
             assert_eq!(control.judge(sweep * SWEEP_NANOS, waited, now), None);
+        }
+    }
+
+    #[test]
+    fn one_short_step_does_not_lower_the_pace() {
+        let mut control = PaceControl::new();
+        for sweep in 0..60u64 {
+            // From the tenth sweep on half a period earlier.
+            let now = sweep * SWEEP_NANOS + nanos(if sweep < 10 { 50 } else { 0 });
+            assert_eq!(control.judge(now, nanos(40), now), None, "{sweep}");
         }
     }
 

@@ -20,6 +20,10 @@ pub struct PairingConfig {
     pub depth: usize,
 }
 
+/// Last steps between sweeps of the ego whose median is their period: one odd step, and frames that are missing now and
+/// then, change nothing.
+const STEPS: usize = 10;
+
 /// Shortest period of a LiDAR, nanoseconds: sweeps that follow each other faster are repeated ones.
 const SHORTEST_PERIOD_NANOS: u64 = 20_000_000;
 
@@ -73,6 +77,10 @@ pub struct Paired<'a, K, T> {
 #[derive(Debug)]
 pub struct Pairing<K, T> {
     config: PairingConfig,
+    /// Largest lead of a message that counts as of the time of the ego's frame, nanoseconds.
+    pub(crate) lead_nanos: u64,
+    /// Last steps between sweeps of the ego, nanoseconds.
+    steps_nanos: VecDeque<u64>,
     waiting: BTreeMap<K, VecDeque<Waiting<T>>>,
 }
 
@@ -88,21 +96,25 @@ impl<K: Ord + Clone, T> Pairing<K, T> {
     pub fn new(config: PairingConfig) -> Self {
         Self {
             config,
+            lead_nanos: config.max_lead_nanos,
+            steps_nanos: VecDeque::new(),
             waiting: BTreeMap::new(),
         }
     }
 
-    /// Limits the lead to half the time between two sweeps of the ego, nanoseconds: at 20 Hz a message of the sweep before
-    /// is within 50 ms too.
+    /// Limits the lead to half the period of the ego's sweeps, the last of which followed after `step_nanos`: at 20 Hz a
+    /// message of the sweep before is within 50 ms too.
     pub(crate) fn limit_lead(&mut self, step_nanos: u64) {
-        if step_nanos >= SHORTEST_PERIOD_NANOS {
-            self.config.max_lead_nanos = self.config.max_lead_nanos.min(step_nanos / 2);
+        if step_nanos < SHORTEST_PERIOD_NANOS {
+            return;
         }
-    }
-
-    /// Largest lead of a message that counts as of the time of the ego's frame, nanoseconds.
-    pub(crate) fn max_lead_nanos(&self) -> u64 {
-        self.config.max_lead_nanos
+        self.steps_nanos.push_front(step_nanos);
+        self.steps_nanos.truncate(STEPS);
+        let mut sorted = Vec::from_iter(self.steps_nanos.iter().copied());
+        sorted.sort_unstable();
+        // Of two in the middle the shorter one.
+        let period_nanos = sorted[(sorted.len() - 1) / 2];
+        self.lead_nanos = self.config.max_lead_nanos.min(period_nanos / 2);
     }
 
     /// Queues a message. The message that has to be dropped for it is returned: the message itself when it is a
@@ -136,7 +148,7 @@ impl<K: Ord + Clone, T> Pairing<K, T> {
 
     /// The messages that belong to the ego's frame, by sender, and those that will never be used.
     pub fn pair(&mut self, ego_capture_nanos: u64) -> (Vec<Paired<'_, K, T>>, Vec<Dropped<K>>) {
-        let latest = ego_capture_nanos.saturating_add(self.config.max_lead_nanos);
+        let latest = ego_capture_nanos.saturating_add(self.lead_nanos);
         let earliest = ego_capture_nanos.saturating_sub(self.config.max_age_nanos);
         let mut paired = Vec::new();
         let mut dropped = Vec::new();
@@ -175,9 +187,8 @@ impl<K: Ord + Clone, T> Pairing<K, T> {
     /// True if a sender's message for the ego's frame waits, or a later one: then this frame's own is lost, and waiting for
     /// it is useless.
     pub fn has_reached(&self, sender: &K, ego_capture_nanos: u64) -> bool {
-        let lead_nanos = self.config.max_lead_nanos;
         self.capture_times(sender)
-            .any(|time| time.saturating_add(lead_nanos) >= ego_capture_nanos)
+            .any(|time| time.saturating_add(self.lead_nanos) >= ego_capture_nanos)
     }
 
     /// The capture times of messages of a sender that wait, oldest first.
@@ -186,23 +197,19 @@ impl<K: Ord + Clone, T> Pairing<K, T> {
         queue.map(|held| held.capture_nanos)
     }
 
-    /// All senders with waiting messages.
-    pub fn senders(&self) -> Vec<K> {
-        self.waiting.keys().cloned().collect()
-    }
-
-    /// The clock of the scene was set back to `now_nanos`: removes a sender's messages of later times, except those up to
-    /// `ahead_nanos` early. Returns the number of these that were never used.
-    pub(crate) fn turn_back(&mut self, sender: &K, now_nanos: u64, ahead_nanos: u64) -> usize {
-        let Some(queue) = self.waiting.get_mut(sender) else {
-            return 0;
-        };
+    /// The clock of the scene was set back to `now_nanos`: removes messages of later times, except those up to `ahead_nanos`
+    /// early. Returns the number of these that were never used, by sender.
+    pub(crate) fn turn_back(&mut self, now_nanos: u64, ahead_nanos: u64) -> Vec<(K, usize)> {
         let latest = now_nanos.saturating_add(ahead_nanos);
-        let later = queue.iter().filter(|held| held.capture_nanos > latest);
-        let unused = later.filter(|held| !held.is_used).count();
-        // One that served belongs to the run before, even if it is only a little later.
-        queue.retain(|held| held.capture_nanos <= if held.is_used { now_nanos } else { latest });
-        unused
+        let queues = self.waiting.iter_mut().map(|(sender, queue)| {
+            let later = queue.iter().filter(|held| held.capture_nanos > latest);
+            let unused = later.filter(|held| !held.is_used).count();
+            // One that served belongs to the run before, even if it is only a little later.
+            let kept = |is_used| if is_used { now_nanos } else { latest };
+            queue.retain(|held| held.capture_nanos <= kept(held.is_used));
+            (sender.clone(), unused)
+        });
+        queues.collect()
     }
 
     /// Removes a sender that has left; returns the number of its messages that were never used.
@@ -251,7 +258,8 @@ mod tests {
             assert_eq!(pairing.insert(&cav("a"), frame * FRAME, frame), None);
         }
         assert_eq!(ages(&mut pairing, 50 * FRAME), (vec![0], vec![]));
-        assert_eq!(pairing.turn_back(&cav("a"), 2 * FRAME, 20 * FRAME), 1);
+        let gone = pairing.turn_back(2 * FRAME, 20 * FRAME);
+        assert_eq!(gone, [(cav("a"), 1)]);
         assert_eq!(pairing.insert(&cav("a"), 2 * FRAME, 2), None);
         assert_eq!(ages(&mut pairing, 2 * FRAME), (vec![0], vec![]));
     }
@@ -262,8 +270,8 @@ mod tests {
         assert_eq!(pairing.insert(&cav("a"), 10 * FRAME, 10), None);
         let next = 10 * FRAME + FRAME / 2;
         assert!(pairing.has_reached(&cav("a"), next));
-        // A repeated sweep, one after a gap, and one of 20 Hz.
-        for (step, has_reached) in [(1, true), (3 * FRAME, true), (FRAME / 2, false)] {
+        // A repeated sweep, and one of 20 Hz.
+        for (step, has_reached) in [(1, true), (FRAME / 2, false)] {
             pairing.limit_lead(step);
             assert_eq!(
                 pairing.has_reached(&cav("a"), next),
@@ -275,6 +283,21 @@ mod tests {
         // Of two sweeps within 50 ms each frame has its own.
         assert_eq!(ages(&mut pairing, 10 * FRAME).0, [0]);
         assert_eq!(ages(&mut pairing, next).0, [0]);
+    }
+
+    #[test]
+    fn one_odd_step_and_missing_frames_leave_the_lead() {
+        let lead_after = |steps: &[u64]| {
+            let mut pairing = pairing();
+            steps.iter().for_each(|step| pairing.limit_lead(*step));
+            pairing.lead_nanos
+        };
+        let half = FRAME / 2;
+        assert_eq!(lead_after(&[FRAME, half, FRAME]), half, "10 Hz");
+        assert_eq!(lead_after(&[half, 700 * FRAME, half]), half / 2, "20 Hz");
+        assert_eq!(lead_after(&[half, FRAME, half, FRAME]), half / 2, "gaps");
+        let slower = [[half; STEPS], [FRAME; STEPS]].concat();
+        assert_eq!(lead_after(&slower), half, "the last steps count");
     }
 
     #[test]
@@ -386,7 +409,7 @@ mod tests {
                     lost += dropped.len();
                 }
             }
-            let unused: usize = pairing.senders().iter().map(|cav| pairing.unused(cav)).sum();
+            let unused: usize = pairing.waiting.keys().map(|cav| pairing.unused(cav)).sum();
             prop_assert_eq!(sent, received + lost + unused);
         }
     }

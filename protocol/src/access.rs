@@ -35,18 +35,9 @@ pub struct Principal {
     pub cav: CavId,
 }
 
-/// A text that names no principal.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub enum PrincipalError {
-    /// The text begins with no role.
-    #[error(
-        "{0:?} is no principal: agent-<cav>, ego-<cav>, link-<cav>, replay, scorer, recorder, viewer, ros2 or ros2-<cav>"
-    )]
-    Role(String),
-    /// The role is not followed by a vehicle.
-    #[error(transparent)]
-    Cav(#[from] IdError),
-}
+/// Forms of the text of a principal.
+const FORMS: &str =
+    "agent-<cav>, ego-<cav>, link-<cav>, replay, scorer, recorder, viewer, ros2 or ros2-<cav>";
 
 impl Principal {
     /// A process of a vehicle.
@@ -114,11 +105,8 @@ impl Principal {
             Role::Ros2 => {
                 use Stream::{Detections, Gnss, Imu, Lidar, Pose, Tracks};
                 let streams = [Lidar, Imu, Pose, Detections, Tracks];
-                let robot = if self.is_of_vehicle() {
-                    self.cav.as_str()
-                } else {
-                    "*"
-                };
+                let own = Some(self.cav.as_str()).filter(|_| self.is_of_vehicle());
+                let robot = own.unwrap_or("*");
                 publish.extend(streams_of(runs, &[robot], [Lidar, Imu, Gnss]));
                 subscribe.extend(streams_of(runs, &["*"], streams));
                 subscribe.extend(keys_of(runs, ["stats/*"]));
@@ -256,15 +244,17 @@ impl fmt::Display for Principal {
 }
 
 impl FromStr for Principal {
-    type Err = PrincipalError;
+    type Err = IdError;
 
-    fn from_str(text: &str) -> Result<Self, PrincipalError> {
+    fn from_str(text: &str) -> Result<Self, IdError> {
         // At the first hyphen: no role has one, and an id may begin with one (`agent--1`).
         let (role, cav) = text
             .split_once('-')
             .map_or((text, None), |(role, cav)| (role, Some(cav)));
-        let role = role.parse::<Role>();
-        let role = role.map_err(|_| PrincipalError::Role(excerpt(text, 2 * ProcessId::MAX_LEN)))?;
+        let role: Role = role.parse().map_err(|_| {
+            let text = excerpt(text, 2 * ProcessId::MAX_LEN);
+            IdError(format!("{text:?} is no principal: {FORMS}"))
+        })?;
         match cav {
             Some(cav) => Ok(Self::new(role, &CavId::new(cav)?)),
             None => Ok(Self::of_role(role)),

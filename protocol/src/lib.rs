@@ -113,7 +113,7 @@ pub mod text;
 mod topic;
 pub mod wire;
 
-pub use access::{Operation, Permission, Principal, PrincipalError, RunScope};
+pub use access::{Operation, Permission, Principal, RunScope};
 pub use bev::{BevFeatures, BevGrid};
 pub use body::{Body, BodyShape};
 pub use box3d::{Box3d, Detection, corners_within};

@@ -38,4 +38,11 @@ impl PointCloud {
         let xyzi = self.xyzi.iter().step_by(step).copied().collect();
         Self { xyzi }
     }
+
+    /// Negates y of every point: exchanges left and right.
+    pub fn mirror(&mut self) {
+        for [_, y, ..] in &mut self.xyzi {
+            *y = -*y;
+        }
+    }
 }

@@ -10,21 +10,8 @@ const UNIT_TOLERANCE: f64 = 1e-4;
 
 /// Error of numbers from outside that are not a pose.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
-pub enum InvalidPose {
-    /// A component is NaN, infinite or too large.
-    #[error("pose component {0} is not a finite number within {MAX_ABS_M:e}")]
-    NotFinite(f64),
-    /// The quaternion does not have length one.
-    #[error("pose quaternion has length {0}, not 1")]
-    NotUnit(f64),
-    /// The rotation part of a matrix is not orthonormal or mirrors: the largest absolute entry of `R * R^T - I`, and its
-    /// determinant.
-    #[error("pose matrix is not a rotation: {0}")]
-    NotRotation(String),
-    /// The last row of a 4x4 matrix is not `0 0 0 1`.
-    #[error("pose matrix ends in the row {0:?}, not 0 0 0 1")]
-    LastRow([f64; 4]),
-}
+#[error("pose {0}")]
+pub struct InvalidPose(String);
 
 /// A rigid transform, target-from-source: metres and a unit quaternion.
 ///
@@ -64,15 +51,17 @@ impl Pose {
         }
         let last: [f64; 4] = std::array::from_fn(|column| matrix[(3, column)]);
         if last != [0.0, 0.0, 0.0, 1.0] {
-            return Err(InvalidPose::LastRow(last));
+            let problem = format!("matrix ends in the row {last:?}, not 0 0 0 1");
+            return Err(InvalidPose(problem));
         }
         let rotation: Matrix3<f64> = matrix.fixed_view::<3, 3>(0, 0).into();
         let deviation = (rotation * rotation.transpose() - Matrix3::identity()).amax();
         let determinant = rotation.determinant();
         // Orthonormal with a negative determinant is a mirror, as from left-handed axes.
         if deviation > UNIT_TOLERANCE || determinant < 0.0 {
-            return Err(InvalidPose::NotRotation(format!(
-                "largest deviation from orthonormality {deviation:.2e}, determinant {determinant:.6}"
+            let problem = "matrix is not a rotation: largest deviation from orthonormality";
+            return Err(InvalidPose(format!(
+                "{problem} {deviation:.2e}, determinant {determinant:.6}"
             )));
         }
         let rotation =
@@ -91,7 +80,7 @@ impl Pose {
         }
         let norm = self.rotation_wxyz.iter().map(|q| q * q).sum::<f64>().sqrt();
         if (norm - 1.0).abs() > UNIT_TOLERANCE {
-            return Err(InvalidPose::NotUnit(norm));
+            return Err(InvalidPose(format!("quaternion has length {norm}, not 1")));
         }
         Ok(())
     }
@@ -151,7 +140,8 @@ fn check_bounded(value: f64) -> Result<(), InvalidPose> {
     if value.abs() <= MAX_ABS_M {
         return Ok(());
     }
-    Err(InvalidPose::NotFinite(value))
+    let problem = format!("component {value} is not a finite number within {MAX_ABS_M:e}");
+    Err(InvalidPose(problem))
 }
 
 /// Error of one pose: distance and angle to the true one.
@@ -246,17 +236,17 @@ mod tests {
                 translation_m: [0.0, value, 0.0],
                 ..Pose::IDENTITY
             };
-            assert!(matches!(pose.validate(), Err(InvalidPose::NotFinite(_))));
+            let error = pose.validate().unwrap_err().to_string();
+            assert!(error.contains("not a finite number"), "{error}");
         }
         let short = Pose {
             rotation_wxyz: [0.5, 0.0, 0.0, 0.0],
             ..Pose::IDENTITY
         };
-        assert!(matches!(short.validate(), Err(InvalidPose::NotUnit(_))));
+        let error = short.validate().unwrap_err().to_string();
+        assert_eq!(error, "pose quaternion has length 0.5, not 1");
         let mirror = Matrix4::from_diagonal(&[1.0, -1.0, 1.0, 1.0].into());
-        assert!(matches!(
-            Pose::from_matrix(&mirror),
-            Err(InvalidPose::NotRotation { .. })
-        ));
+        let error = Pose::from_matrix(&mirror).unwrap_err().to_string();
+        assert!(error.contains("is not a rotation"), "{error}");
     }
 }

@@ -45,19 +45,6 @@ pub struct NodeOptions {
     pub inbox: InboxLimits,
 }
 
-impl NodeOptions {
-    /// Until all agents of a run have ended, with at most 1 GiB in flight.
-    pub const fn new(ego: CavId, streams: Vec<Stream>) -> Self {
-        Self {
-            ego,
-            streams,
-            keeps_running: false,
-            max_kept_bytes: 1 << 30,
-            inbox: InboxLimits::PEERS,
-        }
-    }
-}
-
 /// Message counters of the link.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize)]
 pub struct LinkReport {

@@ -6,10 +6,11 @@ use std::time::{Duration, Instant};
 use protocol::{Key, KeyExpr, RunId, Stream, Topic, Verb};
 use serde::{Deserialize, Serialize};
 
+use crate::config::RecorderConfig;
 use bus::bounded_queue::Pop;
 use bus::shutdown::Stop;
 use bus::{Bus, BusError, PassiveSubscriber, RawMessage};
-use recording::{RecordingError, RecordingOptions, RecordingWriter};
+use recording::{RecordingError, RecordingWriter};
 
 /// Messages of one key that may wait for the disk.
 const PLACES: usize = 64;
@@ -20,19 +21,6 @@ const LAST_WORDS: Duration = Duration::from_secs(3);
 
 /// Silence that ends a recording that is asked to stop: messages published before that may still be under way.
 const SILENCE: Duration = Duration::from_millis(200);
-
-/// Options of the recorder.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct RecorderOptions {
-    /// The new file.
-    pub out: PathBuf,
-    /// Options of the file.
-    pub recording: RecordingOptions,
-    /// Streams to leave out, before and after the link: feature maps, for example, are most of the bytes.
-    pub without: Vec<Stream>,
-    /// True to continue when the replay has ended, for the next one.
-    pub keeps_running: bool,
-}
 
 /// Report of a recording.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
@@ -112,14 +100,15 @@ pub enum RecorderError {
 /// [`RecorderError`] if the recording cannot begin.
 pub fn record(
     bus: &Bus,
-    options: &RecorderOptions,
+    config: &RecorderConfig,
     stop: &Stop,
     on_failure: &mut dyn FnMut(&RecordReport),
 ) -> Result<RecordReport, RecorderError> {
-    let (writer, failure) = match RecordingWriter::create(&options.out, options.recording) {
+    let keeps_running = config.keep_running || config.bus.supervised;
+    let (writer, failure) = match RecordingWriter::create(&config.out, config.record.options()) {
         Ok(writer) => (Some(writer), None),
         // A run that waits for its recorder must not wait forever.
-        Err(error) if options.keeps_running => {
+        Err(error) if keeps_running => {
             tracing::error!("nothing is recorded, the run continues: {error}");
             (None, Some(in_words(&error)))
         }
@@ -129,14 +118,14 @@ pub fn record(
     let presence = bus.announce(protocol::Role::Recorder)?;
     let mut recorder = Recorder {
         writer,
-        without: &options.without,
+        without: &config.record.without,
         run: &bus.identity().run,
         over: None,
         taken: 0,
         span: None,
         on_failure,
         report: RecordReport {
-            file: options.out.clone(),
+            file: config.out.clone(),
             failure,
             ..RecordReport::default()
         },
@@ -144,7 +133,7 @@ pub fn record(
     if recorder.report.failure.is_some() {
         (recorder.on_failure)(&recorder.report);
     }
-    recorder.listen(&subscriber, options.keeps_running, stop);
+    recorder.listen(&subscriber, keeps_running, stop);
     recorder.report.router_gone_s = bus.router_lost().as_secs_f64();
     let report = recorder.finish(subscriber.overwritten(), subscriber.undelivered());
     presence.withdraw()?;

@@ -1,12 +1,20 @@
 //! Buses for tests: a router on a free port of this machine and any number of clients.
 
 use std::net::TcpListener;
+use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
-use bus::{self, Bus, BusOptions, Endpoint, Event, Identity, Inbox, bounded_queue::Pop};
+use bus::{
+    self, Bus, BusConfig, BusOptions, Endpoint, Event, Identity, Inbox, InboxLimits,
+    bounded_queue::Pop,
+};
+use dataset::LoadOptions;
 use ego_fuser::config::EgoSettings;
 use ego_fuser::node::NodeOptions;
-use protocol::{CavId, ProcessId, RunId, Topic};
+use protocol::{CavId, ProcessId, RunId, Stream, Topic};
+use sim_replay::config::{RecorderConfig, RecordingConfig};
+use sim_replay::link_node;
+use sim_replay::stream::StreamOptions;
 use zenoh::Session;
 
 /// Longer than any step of a test takes, on a machine however busy.
@@ -19,6 +27,50 @@ pub fn ego_options(deadline: Duration) -> NodeOptions {
         deadline_ms: u64::try_from(deadline.as_millis()).unwrap_or(u64::MAX),
         ..EgoSettings::default()
     })
+}
+
+/// Options of a replay of all vehicles once, at the recorded pace.
+#[must_use]
+pub fn stream_options() -> StreamOptions {
+    StreamOptions {
+        agents: Vec::new(),
+        rate: 1.0,
+        repeats: false,
+        seek: 0,
+        frames: None,
+        load: LoadOptions::default(),
+        await_agents: true,
+        expect: Vec::new(),
+        ready_timeout: TIMEOUT,
+        lockstep: Vec::new(),
+        answer_timeout: TIMEOUT,
+        link: None,
+        checkpoint: None,
+    }
+}
+
+/// Options of the link of one stream to an ego, until all agents of a run have ended, with at most 1 GiB in flight.
+#[must_use]
+pub fn link_options(ego: CavId, stream: Stream) -> link_node::NodeOptions {
+    link_node::NodeOptions {
+        ego,
+        streams: vec![stream],
+        keeps_running: false,
+        max_kept_bytes: 1 << 30,
+        inbox: InboxLimits::PEERS,
+    }
+}
+
+/// Configuration of a recorder of everything, until it is stopped.
+#[must_use]
+pub fn recorder_config(bus: &Bus, out: PathBuf) -> RecorderConfig {
+    RecorderConfig {
+        run: bus.identity().run.clone(),
+        out,
+        record: RecordingConfig::default(),
+        keep_running: true,
+        bus: BusConfig::default(),
+    }
 }
 
 /// Router for the clients of one test.

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 
 use dataset::cloud_files::clouds_at;
 use localization::pgc::LocalizerInput;
-use localization::pgc::head_files::{encoder_of, head_file};
+use localization::pgc::head_files::{encoder_or_named, head_file};
 use localization::place_localizer::place_localizer;
 use perception::inference::Inference;
 use protocol::PoseEstimate;
@@ -16,7 +16,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let cloud = arguments.next().ok_or("which cloud?")?;
     let head = head_file(&arguments.next().unwrap_or("town1".into()))?;
     // The head names the encoder with which it was trained. Poses are not registered to a surfel map.
-    let files = [&encoder_of(&head)?, &head, Path::new("")];
+    let files = [&encoder_or_named(None, &head)?, &head, Path::new("")];
     let mut localizer = place_localizer(files, 0.0, Inference::default(), |_| ())?;
     for file in clouds_at(&[cloud]) {
         let file = file?;
@@ -31,11 +31,11 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
                 let [x, y, z] = world_from_cav.translation_m;
                 println!(
                     "{}: x {x:.2} y {y:.2} z {z:.2} m, confidence {confidence:.3}",
-                    file.path().display()
+                    file.path.display()
                 );
             }
             PoseEstimate::NoPose { reason, .. } => {
-                println!("{}: no pose, {reason:?}", file.path().display());
+                println!("{}: no pose, {reason:?}", file.path.display());
             }
         }
     }

@@ -21,7 +21,7 @@ use crate::pgc::pose_solver::FoundPose;
 use crate::pgc::{Localization, Localize, LocalizerError, LocalizerInput, stopwatch};
 use crate::registration::icp::surfel_map::SurfelMap;
 use crate::registration::icp::{IcpFit, IcpSource, MIN_POINTS, Plane, is_level, register};
-use crate::tracker::unscaled_std;
+use crate::tracker::{PoseMeasurement, unscaled_std};
 
 /// Stage of a localization.
 const REGISTER: &str = "pose register";
@@ -38,6 +38,8 @@ const LEAST_LEVEL: usize = 10;
 const SURE: f64 = 0.8;
 /// Largest distance of a registered pose from its start, metres: a step beyond is no refinement.
 const MOST_MOVED_M: f64 = 1.5;
+/// Standard deviations of its start beyond which a registered pose is doubted: one sound pose in a hundred is.
+const CONTRADICTED_STD: f64 = 4.0;
 /// Factor on the standard deviations of a registration: distances of neighbouring points to the planes are correlated,
 /// and the planes have errors of their own.
 const STD_FACTOR: f64 = 4.0;
@@ -207,11 +209,7 @@ fn judged(
     registered: Option<FoundPose>,
 ) -> Localization {
     let judged = match registered {
-        Some(registered) => FoundPose {
-            evidence: found.evidence,
-            start_std_m: unscaled_std(found)[0],
-            ..registered
-        },
+        Some(registered) => doubted(found, registered),
         None if found.sigma >= SURE => return localization,
         None => FoundPose {
             is_rejected: true,
@@ -219,6 +217,29 @@ fn judged(
         },
     };
     Localization::new(&Ok(judged), localization.times)
+}
+
+/// A registered pose that knows where it began: far from a sure start it is doubted. A sweep that is not rigid, taken while
+/// driving without correction or by two LiDARs, fits its map beside its place, and closely.
+fn doubted(start: &FoundPose, registered: FoundPose) -> FoundPose {
+    let [from, to] = [start, &registered].map(|found| found.world_from_sensor.translation.vector);
+    let off_m = (to - from).xy().norm();
+    let [std_m, _] = unscaled_std(start);
+    let mut judged = FoundPose {
+        evidence: start.evidence,
+        start_std_m: std_m,
+        ..registered
+    };
+    if off_m > CONTRADICTED_STD * PoseMeasurement::new(0, start).position_std_m {
+        judged.start_std_m = std_m.hypot(off_m);
+        let scale = registered.covariance_scale.unwrap_or(CovarianceScale::NONE);
+        for axis in 0..2 {
+            // The fitted factor is on it, too.
+            judged.cell_covariance[axis][axis] += (off_m / scale.planar).powi(2);
+        }
+        judged.sigma = 1.0 / (1.0 / registered.sigma + 2.0 * off_m * off_m);
+    }
+    judged
 }
 
 /// The pose of a registration. Its confidence is that of the expected squared error (Eq. 6).
@@ -330,6 +351,11 @@ mod tests {
         assert!(pose.sigma > 0.999 && taken.estimate.world_from_cav().is_some());
         // Its bound remembers how unsure the pose was at which the registration began.
         assert!(pose.start_std_m > 0.3, "{}", pose.start_std_m);
+        // A sure pose that it moves far contradicts it: both may be wrong.
+        let (doubted, _) = localized(start, 0.999, 0);
+        let doubted = doubted.found.unwrap();
+        assert!(doubted.is_registered && doubted.sigma < 0.9 && doubted.start_std_m > 0.3);
+        assert!(doubted.cell_covariance[0][0].sqrt() > 0.3);
         // Of too few points with a partner a sure pose stays as it was.
         let (kept, found) = localized(start, SURE, 19_000);
         assert_eq!(kept.found, Some(found));

@@ -4,14 +4,16 @@
 //! the vehicle and a receiver has to give the start.
 
 use crate::Error;
+use crate::drive_frames::{self, MappedDrive};
 use crate::error::listed;
-use crate::sweep_database::{add_faults, posed, present_sweeps};
+use crate::sweep_database::{open_drives, posed, present_sweeps};
 use std::path::Path;
 use std::sync::Arc;
 
-use dataset::{self, LeftOut, LoadOptions, Problem};
+use dataset::{LeftOut, LoadOptions, Problem, Scenario};
 use nalgebra::Isometry3;
 use protocol::{NoPoseReason, PoseEstimate};
+use support::output;
 
 use localization::pose_source::{NO_SOURCE, PoseInput, PoseSource, no_pose};
 use localization::registration::icp::{self, IcpConfig, IcpSource, IcpTarget, NoIcpFit};
@@ -43,7 +45,7 @@ impl PoseSource for IcpMapPose {
                 PoseEstimate::new(fit.target_from_source.into(), confidence)
             }
             Err(NoIcpFit::TooFew { .. }) => no_pose(NoPoseReason::TooFewPoints),
-            Err(NoIcpFit::TooLittleOverlap { .. } | NoIcpFit::Unconstrained { .. }) => {
+            Err(NoIcpFit::TooLittleOverlap(_) | NoIcpFit::Unconstrained(_)) => {
                 no_pose(NoPoseReason::TooFewInliers)
             }
         }
@@ -64,7 +66,8 @@ pub fn check_spacing(spacing_m: f64) -> Result<(), Error> {
 }
 
 /// Builds a point-cloud map of drives with true poses: of every agent a sweep per `spacing_m` metres of path. Sweeps that
-/// cannot be read or have no pose are left out and counted in `left_out`, which also gets the findings about the drives.
+/// cannot be read or have no pose are left out and counted in `left_out`, which also gets the findings about the drives:
+/// also that two of them are not in one frame.
 ///
 /// # Errors
 /// [`Error`] names the drive that cannot be opened, or all drives if no sweep has a pose or none of them has a plane; or the
@@ -77,42 +80,25 @@ pub fn read_map(
 ) -> Result<IcpTarget, Error> {
     check_spacing(spacing_m)?;
     let mut map = IcpTarget::new(config);
-    let mut sweeps = 0;
+    let mut mapped = Vec::new();
     for folder in folders {
-        let drives = dataset::open(folder.as_ref())?;
-        add_faults(&drives, left_out);
-        for scenario in drives.scenarios {
-            let mut last: Option<(usize, Isometry3<f64>)> = None;
-            for (agent, tick) in present_sweeps(&scenario) {
-                // Only the pose at first: points of sweeps that are not used need not be read.
-                let without_points = LoadOptions::without_points();
-                let mut load = |options: &LoadOptions| {
-                    let sweep = posed(&scenario, agent, tick, options);
-                    sweep
-                        .map_err(|error| left_out.add_unreadable(agent, Problem::from(&error)))
-                        .ok()
-                };
-                let Some((_, pose)) = load(&without_points) else {
-                    continue;
-                };
-                let pose = pose.isometry();
-                // From the last sweep on the map, not from the one before: short steps add up.
-                let way_m = last
-                    .filter(|(of, _)| *of == agent)
-                    .map(|(_, last)| (last.translation.vector - pose.translation.vector).norm());
-                if way_m.is_none_or(|way_m| way_m >= spacing_m)
-                    && let Some((frame, _)) = load(&LoadOptions::default())
-                {
-                    map.add(&frame.points.xyzi, &pose);
-                    last = Some((agent, pose));
-                    sweeps += 1;
-                }
-            }
-        }
+        let drives = open_drives(folder.as_ref(), left_out)?;
+        let drives = drives.scenarios.into_iter();
+        mapped.extend(drives.map(|drive| add_drive(&mut map, drive, spacing_m, left_out)));
     }
+    let sweeps: usize = mapped.iter().map(|drive| drive.sweeps.len()).sum();
     let folders = || Vec::from_iter(folders.iter().map(|folder| folder.as_ref().to_owned()));
     if sweeps == 0 {
         return Err(Error::NoSweeps(folders(), left_out.reasons()));
+    }
+    mapped.retain(|drive| !drive.sweeps.is_empty());
+    let (contradictions, alone) = drive_frames::contradictions(&mapped);
+    left_out.add_findings(contradictions);
+    if !alone.is_empty() {
+        let alone = alone.join(", ");
+        output::note(format_args!(
+            "{alone}: no road in common with the drives before: it is not checked whether their poses are in one frame"
+        ));
     }
     map.fit();
     match map.planes() {
@@ -122,6 +108,41 @@ pub fn read_map(
         ))),
         _ => Ok(map),
     }
+}
+
+/// Adds a sweep per `spacing_m` metres of the path of every agent of a drive.
+fn add_drive(
+    map: &mut IcpTarget,
+    scenario: Scenario,
+    spacing_m: f64,
+    left_out: &mut LeftOut,
+) -> MappedDrive {
+    let mut sweeps: Vec<(usize, usize, Isometry3<f64>)> = Vec::new();
+    for (agent, tick) in present_sweeps(&scenario) {
+        // Only the pose at first: points of sweeps that are not used need not be read.
+        let without_points = LoadOptions::without_points();
+        let mut load = |options: &LoadOptions| {
+            let sweep = posed(&scenario, agent, tick, options);
+            sweep
+                .map_err(|error| left_out.add_unreadable(agent, Problem::from(&error)))
+                .ok()
+        };
+        let Some((_, pose)) = load(&without_points) else {
+            continue;
+        };
+        let pose = pose.isometry();
+        // From the last sweep on the map, not from the one before: short steps add up.
+        let last = sweeps.last().filter(|(of, ..)| *of == agent);
+        let way_m =
+            last.map(|(.., last)| (last.translation.vector - pose.translation.vector).norm());
+        if way_m.is_none_or(|way_m| way_m >= spacing_m)
+            && let Some((frame, _)) = load(&LoadOptions::default())
+        {
+            map.add(&frame.points.xyzi, &pose);
+            sweeps.push((agent, tick, pose));
+        }
+    }
+    MappedDrive { scenario, sweeps }
 }
 
 #[cfg(test)]
@@ -223,6 +244,55 @@ mod tests {
             left_out.is_nothing() && left_out != LeftOut::default(),
             "{left_out}"
         );
+    }
+
+    /// A KITTI sequence through the yard whose poses have an offset, metres.
+    fn yard_drive(folder: &Path, offset_m: [f64; 3]) {
+        std::fs::create_dir_all(folder.join("velodyne")).unwrap();
+        let [x_m, y_m, z_m] = offset_m;
+        let mut poses = String::new();
+        for sweep in 0..6_u8 {
+            let points = yard().xyzi.into_iter();
+            let bytes = points.flat_map(|[x, y, z, _]| [x - f32::from(sweep), y, z, 0.1]);
+            let bytes: Vec<u8> = bytes.flat_map(f32::to_le_bytes).collect();
+            std::fs::write(folder.join(format!("velodyne/{sweep:06}.bin")), bytes).unwrap();
+            let along_m = x_m + f64::from(sweep);
+            poses += &format!("1 0 0 {along_m} 0 1 0 {y_m} 0 0 1 {z_m}\n");
+        }
+        std::fs::write(folder.join("calib.txt"), "Tr: 1 0 0 0 0 1 0 0 0 0 1 0\n").unwrap();
+        std::fs::write(folder.join("poses.txt"), poses).unwrap();
+    }
+
+    #[test]
+    fn drives_in_different_frames_are_named_where_they_meet() {
+        let folder = tempfile::tempdir().unwrap();
+        let drive = |name: &str, offset_m| {
+            let drive = folder.path().join(name);
+            yard_drive(&drive, offset_m);
+            drive
+        };
+        let first = drive("00", [0.0; 3]);
+        let findings = |other: &Path| {
+            let mut left_out = LeftOut::default();
+            let config = IcpConfig::default();
+            read_map(&[first.as_path(), other], 0.0, &config, &mut left_out).unwrap();
+            serde_json::to_string(&left_out).unwrap()
+        };
+        let wrong = "not in the frame of those of";
+        let shifted = findings(&drive("01", [4.0, -3.0, 0.0]));
+        assert!(
+            shifted.contains(wrong) && shifted.contains("(-4.0, 3.0, "),
+            "{shifted}"
+        );
+        // The same frame, another floor, and a drive elsewhere.
+        for (name, offset_m) in [
+            ("02", [0.0; 3]),
+            ("03", [0.0, 0.0, 3.0]),
+            ("04", [500.0, 0.0, 0.0]),
+        ] {
+            let sound = findings(&drive(name, offset_m));
+            assert!(!sound.contains(wrong), "{name}: {sound}");
+        }
     }
 
     #[test]

@@ -26,6 +26,7 @@
 
 #![warn(clippy::print_stdout, clippy::print_stderr)]
 
+mod drive_frames;
 mod error;
 pub mod evaluation;
 pub mod icp_map;

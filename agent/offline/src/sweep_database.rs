@@ -2,7 +2,7 @@
 
 use crate::{Error, Result};
 use std::collections::HashMap;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use dataset::frame::Frame;
 use dataset::{
@@ -23,11 +23,8 @@ pub fn described_sweeps<D, E: Into<LocalizerError>>(
     left_out: &mut LeftOut,
     progress: &mut dyn FnMut(usize, usize),
 ) -> Result<Vec<(D, Isometry3<f64>)>> {
-    let datasets = folders.iter().map(|folder| dataset::open(folder));
-    let datasets: Vec<_> = datasets.collect::<Result<_, _>>()?;
-    for dataset in &datasets {
-        add_faults(dataset, left_out);
-    }
+    let datasets = folders.iter().map(|folder| open_drives(folder, left_out));
+    let datasets: Vec<_> = datasets.collect::<Result<_>>()?;
     let scenarios = datasets.iter().flat_map(|dataset| &dataset.scenarios);
     let all: Vec<_> = scenarios
         .flat_map(|scenario| present_sweeps(scenario).map(move |sweep| (scenario, sweep)))
@@ -49,11 +46,17 @@ pub fn described_sweeps<D, E: Into<LocalizerError>>(
     }
 }
 
-/// Adds what is wrong with drives as a whole: files that are not used, and findings about those that are.
-pub fn add_faults(drives: &Dataset, left_out: &mut LeftOut) {
+/// Opens the drives of a folder, and adds what is wrong with them as a whole: files that are not used, and findings about
+/// those that are.
+///
+/// # Errors
+/// [`Error`] names the folder that cannot be opened.
+pub fn open_drives(folder: &Path, left_out: &mut LeftOut) -> Result<Dataset> {
+    let drives = dataset::open(folder)?;
     left_out.add_files(&drives.problems);
     let findings = findings::sampled(&drives.scenarios, IntensityScale::AUTO, None);
     left_out.add_findings(findings);
+    Ok(drives)
 }
 
 /// The statement that two of some folders have the same scenario; `None` if each scenario is there once.
@@ -85,7 +88,7 @@ fn first_sweep(scenario: &Scenario) -> Option<(PathBuf, u64)> {
 }
 
 /// Agent and tick of all sweeps of a scenario, vehicle by vehicle, in the order of time.
-pub(crate) fn present_sweeps(scenario: &Scenario) -> impl Iterator<Item = (usize, usize)> {
+pub fn present_sweeps(scenario: &Scenario) -> impl Iterator<Item = (usize, usize)> {
     let all = (0..scenario.agents.len())
         .flat_map(move |agent| (0..scenario.ticks.len()).map(move |tick| (agent, tick)));
     all.filter(move |&(agent, tick)| scenario.is_present(agent, tick))
@@ -101,10 +104,8 @@ pub(crate) fn posed(
     let frame = scenario.load(agent, tick, options)?;
     let Some(pose) = frame.world_from_lidar else {
         let path = scenario.points_path(agent, tick, None)?;
-        return Err(ReadError::malformed(
-            &path,
-            "there is no pose for this sweep",
-        ));
+        let reason = "there is no pose for this sweep";
+        return Err(ReadError::malformed(&path, reason));
     };
     Ok((frame, pose))
 }

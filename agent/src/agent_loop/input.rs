@@ -22,6 +22,8 @@ pub enum LoopInput {
     PaceEnded(CavId),
     /// There are no more sweeps. After the last one the loop ends.
     Ended,
+    /// The scene has ended, and the loop waits for the next one.
+    SceneEnded,
     /// The next step is made, if it is time for it.
     Wake,
 }

@@ -193,16 +193,17 @@ impl AgentLoop {
                 self.start_at(capture_nanos, &gnss);
             }
             LoopInput::Gnss(capture_nanos, gnss) => {
-                let poses = self.pairing.add_pose(capture_nanos, gnss.world_from_lidar);
+                let poses = self.pairing.poses.add(capture_nanos, gnss.world_from_lidar);
                 self.drop_messages(Stream::Gnss, poses, DropReason::Superseded);
             }
             LoopInput::Motion(capture_nanos, motion) => {
-                let motions = self.pairing.add_motion(capture_nanos, motion);
+                let motions = self.pairing.motions.add(capture_nanos, motion);
                 self.drop_messages(Stream::Imu, motions, DropReason::Superseded);
             }
             LoopInput::Pace(ego, pace) => self.follow(&ego, pace, now_nanos),
             LoopInput::PaceEnded(ego) => self.selection.forget(&ego),
             LoopInput::Ended => self.has_ended = true,
+            LoopInput::SceneEnded => self.reports.has_ended = true,
             LoopInput::Wake => self.wake(now_nanos),
         }
         std::mem::take(&mut self.outputs)

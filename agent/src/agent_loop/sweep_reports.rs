@@ -11,7 +11,7 @@ use super::LoopOptions;
 /// Period at which an agent publishes its descriptor, for processes that join late and as a report of its sweeps,
 /// nanoseconds.
 const PERIOD_NANOS: u64 = 500_000_000;
-/// First sweeps that are reported at once: so many make an estimate of the capture clock.
+/// First sweeps of a scene that are reported at once: so many make an estimate of the capture clock.
 const EARLY_SWEEPS: usize = 3;
 /// Sweeps of a report at most.
 const MAX_SWEEPS: usize = 32;
@@ -27,6 +27,8 @@ pub(super) struct SweepReports {
     sweeps: VecDeque<(u64, u64)>,
     /// Sweeps that are still reported at once.
     early: usize,
+    /// True from the end of a scene to the first sweep of the next one: the reports name no stream.
+    pub(super) has_ended: bool,
 }
 
 /// Descriptor of a vehicle that publishes these streams beside its pose, without sweeps.
@@ -50,6 +52,7 @@ impl SweepReports {
             next_nanos: 0,
             sweeps: VecDeque::new(),
             early: EARLY_SWEEPS,
+            has_ended: false,
         }
     }
 
@@ -59,6 +62,9 @@ impl SweepReports {
         if newest.is_some_and(|(newest, _)| capture_nanos < *newest) {
             // The clock of the scene was set back.
             self.sweeps.clear();
+        }
+        if std::mem::take(&mut self.has_ended) {
+            self.early = EARLY_SWEEPS;
         }
         self.sweeps.push_back((capture_nanos, arrived_nanos));
         if self.sweeps.len() > MAX_SWEEPS {
@@ -87,6 +93,7 @@ impl SweepReports {
             });
         let mut descriptor = self.description.clone()?;
         descriptor.sweeps = sweeps.collect();
+        descriptor.streams.retain(|_| !self.has_ended);
         Some((newest, descriptor))
     }
 }

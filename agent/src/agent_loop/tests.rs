@@ -138,6 +138,32 @@ fn after_the_end_a_sweep_waits_for_nothing() {
 }
 
 #[test]
+fn between_two_scenes_the_descriptor_names_no_stream() {
+    let folder = tempfile::tempdir().unwrap();
+    let agent = agent(&write_weights(folder.path()));
+    let mut agent_loop = AgentLoop::new(agent, LoopOptions::default());
+    let publishes = vec![Stream::Pose, Stream::Bev];
+    for (input, second, expected) in [
+        (LoopInput::Wake, 1, vec![publishes.clone()]),
+        (LoopInput::SceneEnded, 1, vec![]),
+        (LoopInput::Wake, 2, vec![vec![]]),
+        (LoopInput::Wake, 3, vec![vec![]]),
+        (sweep(10), 3, vec![publishes]),
+    ] {
+        let outputs = agent_loop.handle(input, second * NOW).into_iter();
+        let named = outputs.filter_map(|output| match output {
+            LoopOutput::Publish(message) => match message.content {
+                Content::Fixed(Message::Descriptor(descriptor)) => Some(descriptor.streams),
+                _ => None,
+            },
+            _ => None,
+        });
+        assert_eq!(named.collect::<Vec<_>>(), expected, "at {second} s");
+    }
+    assert!(!agent_loop.is_finished());
+}
+
+#[test]
 fn a_sweep_that_does_not_fail_by_its_values_is_counted_apart() {
     let agent = Agent::without_detector(cav(), Box::new(RecordedPose));
     let mut agent_loop = AgentLoop::new(agent, LoopOptions::default());

@@ -30,4 +30,4 @@ pub mod metrics;
 mod track;
 mod tracker;
 
-pub use tracker::{Tracker, TrackerConfig, TrackingError};
+pub use tracker::{Tracker, TrackerConfig};

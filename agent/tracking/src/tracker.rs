@@ -2,8 +2,7 @@
 
 use nalgebra::{Isometry3, Point3};
 use protocol::{
-    Detection, Detections, InvalidPose, PerceivedObject, PlanarCovariance, Pose, PoseEstimate,
-    Track, Tracks,
+    Detection, Detections, PerceivedObject, PlanarCovariance, Pose, PoseEstimate, Track, Tracks,
 };
 
 use crate::assignment;
@@ -68,22 +67,6 @@ impl Default for TrackerConfig {
     }
 }
 
-/// Reason why a frame was not taken; the tracks are as before.
-#[derive(Debug, Clone, PartialEq, thiserror::Error)]
-pub enum TrackingError {
-    /// Time does not advance.
-    #[error("capture time {given_nanos} ns is not after the frame before, {previous_nanos} ns")]
-    Time {
-        /// Capture time of the last frame.
-        previous_nanos: u64,
-        /// Capture time of this frame.
-        given_nanos: u64,
-    },
-    /// The pose of the ego is none.
-    #[error("world_from_ego: {0}")]
-    Pose(#[from] InvalidPose),
-}
-
 /// Tracks of one vehicle.
 #[derive(Debug, Clone, Default)]
 pub struct Tracker {
@@ -146,19 +129,17 @@ impl Tracker {
     /// Takes a frame and returns the tracks at its capture time in the ego's LiDAR frame, ordered by id.
     ///
     /// `world_from_ego` is the pose of the ego's LiDAR, `covariance` that of this pose in the plane of the world (`None`:
-    /// taken as 0), and `detections` are in the ego's LiDAR frame.
-    ///
-    /// # Errors
-    /// [`TrackingError`] when time does not advance, or the pose is none; nothing has changed then.
+    /// taken as 0), and `detections` are in the ego's LiDAR frame. `None` when time does not advance, or the pose is none:
+    /// nothing has changed then.
     pub fn update(
         &mut self,
         capture_nanos: u64,
         world_from_ego: &Pose,
         covariance: Option<&PlanarCovariance>,
         detections: &[Detection],
-    ) -> Result<Vec<Track>, TrackingError> {
+    ) -> Option<Vec<Track>> {
         let ego_from_world = self.take(capture_nanos, world_from_ego, covariance, detections)?;
-        Ok(self.reported(&ego_from_world))
+        Some(self.reported(&ego_from_world))
     }
 
     /// Takes a frame; where time does not advance all tracks end first. `None` without a usable pose.
@@ -173,19 +154,18 @@ impl Tracker {
         }
         let world_from_cav = pose.world_from_cav()?;
         self.take(capture_nanos, world_from_cav, pose.covariance(), detections)
-            .ok()
     }
 
-    /// Takes a frame and returns `ego_from_world`.
+    /// Takes a frame and returns `ego_from_world`; `None` as of [`Self::update`].
     fn take(
         &mut self,
         capture_nanos: u64,
         world_from_ego: &Pose,
         covariance: Option<&PlanarCovariance>,
         detections: &[Detection],
-    ) -> Result<Isometry3<f64>, TrackingError> {
-        // Before time advances: after an error everything is as it was.
-        world_from_ego.validate()?;
+    ) -> Option<Isometry3<f64>> {
+        // Before time advances: a frame that is not taken changes nothing.
+        world_from_ego.validate().ok()?;
         let elapsed_s = self.advance(capture_nanos)?;
         let world_from_ego = world_from_ego.isometry();
         let measure =
@@ -202,7 +182,7 @@ impl Tracker {
         // After `count_misses`: owners are indices into the list of tracks.
         self.tracks.retain(|track| track.is_alive(&self.config));
         self.begin(&measurements, &owners);
-        Ok(ego_from_world)
+        Some(ego_from_world)
     }
 
     fn reported(&self, ego_from_world: &Isometry3<f64>) -> Vec<Track> {
@@ -211,20 +191,13 @@ impl Tracker {
         reported.map(|track| track.report(ego_from_world)).collect()
     }
 
-    /// Time since the frame before, seconds; 0 for the first.
-    fn advance(&mut self, given_nanos: u64) -> Result<f64, TrackingError> {
-        let elapsed_nanos = match self.last_nanos {
-            Some(previous_nanos) if given_nanos <= previous_nanos => {
-                return Err(TrackingError::Time {
-                    previous_nanos,
-                    given_nanos,
-                });
-            }
-            Some(previous_nanos) => given_nanos - previous_nanos,
-            None => 0,
-        };
-        self.last_nanos = Some(given_nanos);
-        Ok(elapsed_nanos as f64 / 1e9)
+    /// Time since the frame before, seconds; 0 for the first, `None` where it does not advance.
+    fn advance(&mut self, given_nanos: u64) -> Option<f64> {
+        if self.last_nanos.is_some_and(|last| given_nanos <= last) {
+            return None;
+        }
+        let last_nanos = self.last_nanos.replace(given_nanos).unwrap_or(given_nanos);
+        Some((given_nanos - last_nanos) as f64 / 1e9)
     }
 
     /// Gives detections to tracks; returns the index of the track of each detection.

@@ -38,10 +38,10 @@ pub(crate) fn metrics(
     pose_source: &str,
     seconds: f64,
 ) -> Metrics {
-    let names = [evaluator.ego().method().name(), pose_source];
-    let (ledger, sent_bytes) = (evaluator.ledger(), Some(evaluator.sent_bytes()));
+    let names = [evaluator.ego.method().name(), pose_source];
+    let (ledger, sent_bytes) = (&evaluator.ledger, Some(evaluator.sent_bytes));
     Metrics {
-        left_out: evaluator.left_out().clone(),
+        left_out: evaluator.left_out.clone(),
         protocol: evaluator.protocol(),
         ..Metrics::of(scores, clock, names, seconds, ledger, sent_bytes)
     }

@@ -10,7 +10,6 @@ use std::path::{Path, PathBuf};
 use agent::config::{AgentSettings, FleetPlace};
 use anyhow::{Context, Result, anyhow, bail, ensure};
 use dataset::evaluation_protocol::EvaluationProtocol;
-use dataset::ground_truth::GroundTruthRule;
 use dataset::{self, OpenOptions, Problem, Scenario as Recorded, findings};
 use deploy::operate::keys::{KeyFileError, principals_of};
 use deploy::operate::run_folder::RunFolder;
@@ -61,11 +60,10 @@ pub struct Fleet {
 /// the configuration of the detector.
 fn load_models(scenario: &Scenario) -> Result<DetectorConfig> {
     let weights = &scenario.models.weights;
-    let detector = Weights::load(weights)
-        .and_then(|weights| weights.detector_config())
-        .context("weights")?;
+    let weights = Weights::load(weights).context("weights")?;
+    let detector = weights.detector_config().context("weights")?;
     // As the ego-fuser does: weights of another method are refused.
-    Ego::load(weights, Some(scenario.method), Device::Cpu).context("weights")?;
+    Ego::from_weights(&weights, Some(scenario.method), Device::Cpu).context("weights")?;
     // Every vehicle loads the networks of its pose source for itself; errors are better reported once.
     let poses = scenario.poses();
     let mut networks = poses.iter().filter(|pose| pose.looks_at_sweeps());
@@ -179,12 +177,8 @@ impl Fleet {
         })
     }
 
-    /// Rule of the counted objects: those of the protocol inside the area of the model.
-    pub(crate) fn ground_truth_rule(&self) -> GroundTruthRule {
-        self.applied_protocol().ground_truth
-    }
-
-    /// The protocol with the ground-truth range as it is applied to the model.
+    /// The protocol with the ground-truth range as it is applied to the model: counted are its objects inside the area of
+    /// the model.
     pub(crate) fn applied_protocol(&self) -> EvaluationProtocol {
         self.protocol.within(self.detector.lidar_range_m)
     }
@@ -301,9 +295,73 @@ fn scenario_of<'a>(scenarios: &'a [Recorded], scene: &SceneConfig) -> Result<&'a
         seek < ticks,
         "scene.seek is {seek}, but scenario {name} has {ticks} ticks"
     );
+    let (asked, known) = (scene.variant.as_ref(), &recorded.lidar_variants);
+    if let Some(asked) = asked.filter(|asked| !known.contains(asked)) {
+        bail!("scene.variant is {asked:?}, but scenario {name} has {known:?}");
+    }
     Ok(recorded)
 }
 
 fn texts(agents: &[CavId]) -> Vec<String> {
     agents.iter().map(ToString::to_string).collect()
+}
+
+/// Sentence about weights that `vehicles` gives the ego: it has those of `models`.
+pub(crate) fn unused_weights(scenario: &Scenario, ego: &CavId) -> Option<String> {
+    let own = scenario.vehicles.get(ego)?.over(&AgentSettings::default());
+    let weights = own.weights?;
+    let field = format!("vehicles.{ego}.weights is {}", weights.display());
+    Some(format!(
+        "without effect: {field}, but the ego has those of models"
+    ))
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+
+    use super::*;
+
+    #[test]
+    fn weights_of_the_ego_as_one_of_the_vehicles_are_named() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("s.yaml");
+        let text = "scene: {dir: .}\nmodels: {weights: .}\nvehicles: {a: {weights: w}}\n";
+        fs::write(&file, text).unwrap();
+        let scenario = Scenario::read(&file).unwrap();
+        let [of_ego, of_other] =
+            ["a", "b"].map(|ego| unused_weights(&scenario, &CavId::new(ego).unwrap()));
+        let found = of_ego.unwrap();
+        assert!(
+            found.starts_with("without effect: vehicles.a.weights is "),
+            "{found}"
+        );
+        assert_eq!(of_other, None);
+    }
+
+    #[test]
+    fn a_variant_that_the_scenario_does_not_have_is_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        let (agent, file) = (folder.path().join("1"), folder.path().join("s.yaml"));
+        fs::create_dir(&agent).unwrap();
+        let pose = "lidar_pose: [0, 0, 2, 0, 0, 0]\nvehicles: {}\n";
+        fs::write(agent.join("000000.yaml"), pose).unwrap();
+        for sweep in ["000000.pcd", "000000_fog_0.060.pcd"] {
+            fs::write(agent.join(sweep), "").unwrap();
+        }
+        let found = dataset::open(folder.path()).unwrap().scenarios;
+        fs::write(&file, "scene: {dir: .}\nmodels: {weights: .}\n").unwrap();
+        let mut scene = Scenario::read(&file).unwrap().scene;
+        for variant in [None, Some("fog_0.060")] {
+            scene.variant = variant.map(str::to_owned);
+            scenario_of(&found, &scene).unwrap();
+        }
+        scene.variant = Some("fog".into());
+        let problem = scenario_of(&found, &scene).unwrap_err().to_string();
+        let expected = "scene.variant is \"fog\", but scenario";
+        assert!(
+            problem.starts_with(expected) && problem.ends_with("has [\"fog_0.060\"]"),
+            "{problem}"
+        );
+    }
 }

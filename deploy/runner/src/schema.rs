@@ -1,6 +1,6 @@
 //! JSON schemas of the configuration files, generated from the types that read them.
 
-use schemars::{JsonSchema, SchemaGenerator, generate::SchemaSettings};
+use schemars::{SchemaGenerator, generate::SchemaSettings};
 
 use link::LinkConfig;
 
@@ -21,18 +21,14 @@ pub enum SchemaOf {
 impl SchemaOf {
     /// The schema as indented JSON with a line end.
     pub fn json(self) -> String {
-        let text = match self {
-            Self::Scenario => text_of::<Scenario>(),
-            Self::Experiment => text_of::<Experiment>(),
-            Self::Link => text_of::<LinkConfig>(),
+        let generator = SchemaGenerator::new(SchemaSettings::draft07());
+        let schema = match self {
+            Self::Scenario => generator.into_root_schema_for::<Scenario>(),
+            Self::Experiment => generator.into_root_schema_for::<Experiment>(),
+            Self::Link => generator.into_root_schema_for::<LinkConfig>(),
         };
-        text + "\n"
+        format!("{:#}\n", schema.to_value())
     }
-}
-
-fn text_of<T: JsonSchema>() -> String {
-    let generator = SchemaGenerator::new(SchemaSettings::draft07());
-    format!("{:#}", generator.into_root_schema_for::<T>().to_value())
 }
 
 #[cfg(test)]

@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use crate::operate::status::RunStatus;
-use crate::report::{Comparison, RunReport, TrackReport, track_table};
+use crate::report::{Comparison, RunReport, TrackReport, distinguish, track_table};
 use serde::Serialize;
 use support::cli::{BadInput, Outcome};
 use support::file_error::Result;
@@ -34,7 +34,9 @@ impl Arguments {
         let folders = runs.map(|run| RunStatus::folder(run, &self.runs));
         let folders = folders.collect::<Result<Vec<_>, _>>()?;
         if self.tracks {
-            let reports = read(&folders, TrackReport::read)?;
+            let mut reports = read(&folders, TrackReport::read)?;
+            let names = reports.iter_mut().map(|report| &mut report.run);
+            distinguish(&mut Vec::from_iter(names), &folders);
             match self.json {
                 true => print_json(&reports)?,
                 false => output::text(track_table(&reports))?,

@@ -1,7 +1,6 @@
 //! `v2vloc view`.
 
 use std::net::SocketAddr;
-use std::path::Path;
 use std::sync::Arc;
 
 use crate::operate::status::{Phase, RunStatus};
@@ -33,24 +32,20 @@ impl Arguments {
         if let Some((name, router)) = self.run.remote() {
             return self.show_live(name, router, None);
         }
-        if let Some(file) = self.run.run.as_ref().filter(|path| path.is_file()) {
-            return self.show_recording(file);
-        }
-        let folder = self.run.folder()?;
-        match RunStatus::read(&folder) {
+        let file = self.run.run.clone().filter(|path| path.is_file());
+        let path = file.map_or_else(|| self.run.folder(), Ok)?;
+        match RunStatus::read(&path) {
             Ok(status) if status.phase == Phase::Running => {
                 let (run, endpoint) = (&status.run, &status.endpoint);
                 output::note(format_args!("run {run} goes on at {endpoint}"));
                 self.show_live(&run.parse()?, &endpoint.parse()?, status.protocol)
             }
-            // Without a status it may still hold a recording.
-            _ => self.show_recording(&folder),
+            // Without a status it may be or hold a recording.
+            _ => {
+                show_recorded(&path, self.page)?;
+                Ok(Outcome::Done)
+            }
         }
-    }
-
-    fn show_recording(&self, path: &Path) -> anyhow::Result<Outcome> {
-        show_recorded(path, self.page)?;
-        Ok(Outcome::Done)
     }
 
     /// Shows a run that goes on, judged by its evaluation protocol if that is known.

@@ -18,13 +18,14 @@ pub(crate) struct WatchedRun {
     #[arg(long, default_value = "runs", conflicts_with = "connect")]
     runs: PathBuf,
     /// Router of a live run without a folder here, tcp/HOST:PORT; `v2vloc up` prints it.
-    #[arg(long, requires = "name", value_name = "ENDPOINT")]
+    // Required as a group of one option: clap forgets the requirement of an option that another excludes.
+    #[arg(long, group = "remote", requires = "name", value_name = "ENDPOINT")]
     connect: Option<Endpoint>,
     /// Name of the run (--connect).
-    #[arg(long = "run", id = "name", requires = "connect", value_name = "NAME")]
+    #[arg(long = "run", id = "name", requires = "remote", value_name = "NAME")]
     name: Option<RunId>,
     /// Folder with the viewer's keys, where the run has security; `v2vloc keys` writes DIR/viewer (--connect).
-    #[arg(long, value_name = "DIR", requires = "connect")]
+    #[arg(long, value_name = "DIR", requires = "remote")]
     keys: Option<PathBuf>,
 }
 

@@ -42,12 +42,8 @@ impl Failures {
                 is_optional: true,
             } => format!("{how}; the run went on without it"),
             ProcessEventKind::Failed { how } => format!("{how} when it was asked to end"),
-            ProcessEventKind::GaveUp {
-                is_optional: false, ..
-            }
-            | ProcessEventKind::Started { .. }
-            | ProcessEventKind::Crashed { .. }
-            | ProcessEventKind::Done { data_lost: false } => return None,
+            // Either the run ends with it, or it is no failure.
+            _ => return None,
         };
         self.failed.insert(name.clone(), text);
         self.failed.get(name).map(String::as_str)

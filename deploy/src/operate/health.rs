@@ -246,24 +246,21 @@ impl Health {
 
     /// Status of every process; `progress` has what they reported.
     pub(crate) fn statuses(&self, progress: &Progress, now: Instant) -> Vec<ProcessStatus> {
+        let elapsed_s = |since: Instant| now.saturating_duration_since(since).as_secs_f64();
         let statuses = self.processes.iter().map(|(name, noted)| {
             let Some(pid) = noted.status.pid else {
                 return noted.status.clone();
             };
             ProcessStatus {
-                up_s: elapsed_s(noted.started, now),
+                up_s: elapsed_s(noted.started),
                 problems: progress.problems.get(name).cloned().unwrap_or_default(),
-                silent_s: noted.last_report.map(|at| elapsed_s(at, now)),
+                silent_s: noted.last_report.map(elapsed_s),
                 usage: Usage::of(pid).unwrap_or_default(),
                 ..noted.status.clone()
             }
         });
         statuses.collect()
     }
-}
-
-fn elapsed_s(since: Instant, now: Instant) -> f64 {
-    now.saturating_duration_since(since).as_secs_f64()
 }
 
 /// Resources of a process, from `/proc`.

@@ -124,10 +124,7 @@ pub fn make(plan: &KeyPlan) -> Result<Vec<PathBuf>, KeyFileError> {
 }
 
 /// The authority: its certificate as text, and its signer.
-struct Authority {
-    pem: String,
-    issuer: Issuer<'static, KeyPair>,
-}
+type Authority = (String, Issuer<'static, KeyPair>);
 
 struct KeyStore<'a> {
     plan: &'a KeyPlan,
@@ -157,11 +154,10 @@ impl KeyStore<'_> {
             self.write(key_path.clone(), &key.serialize_pem(), 0o600)?;
             (pem, key)
         };
-        let issuer = Issuer::new(params, key);
-        Ok(Authority { pem, issuer })
+        Ok((pem, Issuer::new(params, key)))
     }
 
-    fn certify(&mut self, authority: &Authority, name: &str) -> Result<(), KeyFileError> {
+    fn certify(&mut self, (pem, issuer): &Authority, name: &str) -> Result<(), KeyFileError> {
         let folder = &self.plan.folder.join(name);
         let unusable = unusable(format!("a certificate for {name}"));
         let mut params = params(name, self.plan.lifetime)?;
@@ -176,14 +172,12 @@ impl KeyStore<'_> {
             params.subject_alt_names = hosts.collect::<Result<_, _>>()?;
         }
         let key = KeyPair::generate().map_err(&unusable)?;
-        let certificate = params
-            .signed_by(&key, &authority.issuer)
-            .map_err(&unusable)?;
+        let certificate = params.signed_by(&key, issuer).map_err(&unusable)?;
         make_folder(folder)?;
         let path = folder.join(CERTIFICATE_FILE);
         // One that is replaced does not fit the new key.
         let _ = fs::remove_file(&path);
-        self.write(folder.join(AUTHORITY_FILE), &authority.pem, 0o644)?;
+        self.write(folder.join(AUTHORITY_FILE), pem, 0o644)?;
         self.write(folder.join(KEY_FILE), &key.serialize_pem(), 0o600)?;
         // Written last: if it exists, the other files do.
         self.write(path, &certificate.pem(), 0o644)

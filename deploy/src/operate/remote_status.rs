@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use bus::bounded_queue::Pop;
 use bus::{Bus, BusError, present};
-use protocol::{CavId, Detections, KeyExpr, Limits, Stats, Stream, Topic, wire};
+use protocol::{CavId, Detections, KeyExpr, Limits, Stamp, Stats, Stream, Topic, wire};
 use serde::Serialize;
 use terminal::text_table::number;
 
@@ -156,8 +156,8 @@ fn result_line(ego: &RemoteEgo) -> String {
 /// Messages seen so far.
 #[derive(Debug, Default)]
 struct Seen {
-    /// First and last report of each process, with the times on the sender's clock, nanoseconds.
-    reports: BTreeMap<String, [(u64, Stats); 2]>,
+    /// First and last report of each process instance, the newest of its name, with their stamps.
+    reports: BTreeMap<String, [(Stamp, Stats); 2]>,
     /// Last result of each ego, and the number of results.
     results: BTreeMap<CavId, (u64, RemoteEgo)>,
     /// Time of publication of each tick, by capture time, nanoseconds.
@@ -165,24 +165,21 @@ struct Seen {
 }
 
 impl Seen {
-    /// Adds a message; one that cannot be decoded is ignored: its sender then counts as silent.
-    fn add(&mut self, topic: &Topic, pieces: &[&[u8]]) {
+    /// Adds a message. `None` for one that cannot be decoded, which is ignored: its sender then counts as silent.
+    fn add(&mut self, topic: &Topic, pieces: &[&[u8]]) -> Option<()> {
+        let (pieces, limits) = (pieces.iter().copied(), &Limits::DEFAULT);
         match topic {
             Topic::Stats(process) => {
-                let decoded = wire::decode::<Stats>(pieces.iter().copied(), &Limits::DEFAULT);
-                let Ok((header, stats)) = decoded else { return };
-                let report = (header.stamp.publish_nanos, stats);
-                // First and last report: cores in use are the CPU time between the two.
-                self.reports
-                    .entry(process.to_string())
-                    .and_modify(|[_, last]| *last = report.clone())
-                    .or_insert_with(|| [report.clone(), report]);
+                let (header, stats) = wire::decode::<Stats>(pieces, limits).ok()?;
+                let report = (header.stamp, stats);
+                // The CPU time of a restarted process begins anew.
+                let known = self.reports.remove(process.as_str());
+                let known = known.filter(|[(first, _), _]| first.epoch == report.0.epoch);
+                let first = known.map_or_else(|| report.clone(), |[first, _]| first);
+                self.reports.insert(process.to_string(), [first, report]);
             }
             Topic::Stream { cav, stream } if *stream == Stream::Detections => {
-                let decoded = wire::decode::<Detections>(pieces.iter().copied(), &Limits::DEFAULT);
-                let Ok((header, result)) = decoded else {
-                    return;
-                };
+                let (header, result) = wire::decode::<Detections>(pieces, limits).ok()?;
                 let count = self.results.get(cav).map_or(0, |(count, _)| *count) + 1;
                 let (stamp, began) = (&header.stamp, self.ticks.get(&header.stamp.capture_nanos));
                 // Signed: the stamps may be of two clocks.
@@ -196,13 +193,12 @@ impl Seen {
                 self.results.insert(cav.clone(), (count, ego));
             }
             Topic::Truth => {
-                if let Ok(header) = wire::decode_header(pieces.iter().copied()) {
-                    self.ticks
-                        .insert(header.stamp.capture_nanos, header.stamp.publish_nanos);
-                }
+                let stamp = wire::decode_header(pieces).ok()?.stamp;
+                self.ticks.insert(stamp.capture_nanos, stamp.publish_nanos);
             }
             _ => {}
         }
+        Some(())
     }
 
     fn status(self, run: String, time: Duration, alive: &BTreeSet<String>) -> RemoteStatus {
@@ -239,28 +235,33 @@ impl Seen {
     }
 }
 
-fn cores([(first_nanos, first), (last_nanos, last)]: &[(u64, Stats); 2]) -> Option<f64> {
-    let seconds = last_nanos.saturating_sub(*first_nanos) as f64 * 1e-9;
+/// Cores in use: the CPU time between the first and the last report.
+fn cores([(began, first), (ended, last)]: &[(Stamp, Stats); 2]) -> Option<f64> {
+    let seconds = ended.publish_nanos.saturating_sub(began.publish_nanos) as f64 * 1e-9;
     (seconds > 0.0).then(|| (last.usage.cpu_s - first.usage.cpu_s) / seconds)
 }
 
 #[cfg(test)]
 mod tests {
-    use protocol::{Ledger, ProcessId, ProcessUsage, Stamp};
+    use protocol::{Ledger, ProcessId, ProcessUsage};
 
     use super::*;
 
-    fn stamp(capture_nanos: u64, publish_nanos: u64) -> Stamp {
+    fn stamp(epoch: u64, publish_nanos: u64) -> Stamp {
         Stamp {
             cav: CavId::new("1000").unwrap(),
-            epoch: 1,
+            epoch,
             sequence: 0,
-            capture_nanos,
+            capture_nanos: 0,
             publish_nanos,
         }
     }
 
     fn report(seen: &mut Seen, name: &str, at_s: f64, cpu_s: f64) {
+        report_of_instance(seen, (name, 1), at_s, cpu_s);
+    }
+
+    fn report_of_instance(seen: &mut Seen, (name, epoch): (&str, u64), at_s: f64, cpu_s: f64) {
         let process: ProcessId = name.parse().unwrap();
         let usage = ProcessUsage {
             cpu_s,
@@ -279,7 +280,7 @@ mod tests {
                 _ => vec![],
             },
         };
-        let bytes = wire::encode(&stamp(0, (at_s * 1e9) as u64), stats)
+        let bytes = wire::encode(&stamp(epoch, (at_s * 1e9) as u64), stats)
             .unwrap()
             .to_vec();
         seen.add(&Topic::Stats(process), &[&bytes]);
@@ -321,6 +322,21 @@ mod tests {
             ]
         );
         insta::assert_snapshot!(status.table());
+    }
+
+    #[test]
+    fn cores_of_a_restarted_process_are_those_of_its_new_instance() {
+        let mut seen = Seen::default();
+        let found = |seen: &Seen| seen.reports.get("replay").and_then(cores);
+        for (epoch, at_s, cpu_s, expected) in [
+            (1, 1.0, 10.0, None),
+            (1, 2.0, 10.5, Some(0.5)),
+            (2, 3.0, 0.25, None),
+            (2, 5.0, 0.75, Some(0.25)),
+        ] {
+            report_of_instance(&mut seen, ("replay", epoch), at_s, cpu_s);
+            assert_eq!(found(&seen), expected, "at {at_s} s");
+        }
     }
 
     #[test]

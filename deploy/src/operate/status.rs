@@ -1,5 +1,6 @@
 //! `status.json` in the folder of a run: its state, written during the run and for the last time at its end.
 
+use std::fmt::Debug;
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant, UNIX_EPOCH};
@@ -7,6 +8,7 @@ use std::time::{Duration, Instant, UNIX_EPOCH};
 use dataset::evaluation_protocol::EvaluationProtocol;
 use protocol::NeighbourState;
 use serde::{Deserialize, Serialize};
+use serde_json::Value;
 use support::atomic_file;
 use support::bounded_file::{self, MAX_TEXT_BYTES};
 use support::cli::BadInput;
@@ -15,7 +17,7 @@ use terminal::text_table::{Side, TextTable, number};
 
 use crate::operate::health::{ProcessStatus, State, Usage};
 use crate::operate::run_folder::plain;
-use crate::score::Progress;
+use crate::score::{Progress, metrics};
 
 /// File name.
 pub const FILE: &str = "status.json";
@@ -93,7 +95,10 @@ impl RunStatus {
     pub fn read(folder: &Path) -> Result<Self, FileError> {
         let path = folder.join(FILE);
         let text = bounded_file::read_text(&path, MAX_TEXT_BYTES).map_err(|error| {
-            let hint = "is it the folder of a run that `v2vloc up` has started?";
+            let hint = match is_stepped(folder) {
+                true => "a run in simulation time has no processes; `v2vloc report` shows it",
+                false => "is it the folder of a run that `v2vloc up` has started?",
+            };
             FileError::new(&path, format_args!("{error}; {hint}"))
         })?;
         let mut status: Self = serde_json::from_str(&text).at(&path)?;
@@ -236,6 +241,13 @@ impl RunStatus {
     }
 }
 
+/// True if the metrics in a folder are of a run in simulation time.
+fn is_stepped(folder: &Path) -> bool {
+    let text = bounded_file::read_text(&folder.join(metrics::FILE), MAX_TEXT_BYTES);
+    let metrics = text.ok().and_then(|text| serde_json::from_str(&text).ok());
+    metrics.is_some_and(|of: Value| of["clock"] == "stepped")
+}
+
 /// A table with columns of texts, then of numbers, then one of text.
 pub(super) fn table_with_note(texts: &[&str], numbers: &[&str], note: &str) -> TextTable {
     let texts = texts.iter().map(|name| (*name, Side::Left));
@@ -250,12 +262,9 @@ fn why(process: &ProcessStatus) -> Option<String> {
     failure.or_else(|| process.last_exit.clone())
 }
 
-/// Name of a value as in the file.
-pub(super) fn name_of(value: &impl Serialize) -> String {
-    serde_json::to_value(value)
-        .ok()
-        .and_then(|value| value.as_str().map(str::to_owned))
-        .unwrap_or_default()
+/// Name of a state or phase as in the file: each is one word.
+pub(super) fn name_of(value: &impl Debug) -> String {
+    format!("{value:?}").to_lowercase()
 }
 
 /// Writes the status of a run periodically.
@@ -389,6 +398,9 @@ mod tests {
                 .to_string()
                 .contains("status.json")
         );
+        fs::write(run.join(metrics::FILE), r#"{"clock": "stepped"}"#).unwrap();
+        let stepped = RunStatus::read(&run).unwrap_err().to_string();
+        assert!(stepped.contains("`v2vloc report` shows it"), "{stepped}");
         let mut writer = StatusWriter::new(&run, "test", "tcp/127.0.0.1:7447", None);
         let attacker = NeighbourState {
             cav: protocol::CavId::new("4279").unwrap(),

@@ -4,6 +4,7 @@ use std::fmt;
 use std::path::Path;
 
 use bus::config_file;
+use serde::Serialize;
 use serde_json::{Value, json};
 use support::file_error::FileError;
 use terminal::text_table::{Side, TextTable, number};
@@ -59,11 +60,45 @@ const ROWS: [ReportRow; 17] = [
 ];
 
 /// Data, ego, protocol and number of ticks of a run. Precisions of two runs are comparable only where these are equal.
-fn conditions(folder: &Path, metrics: &Metrics) -> Result<Value, FileError> {
-    let scenario: Value = config_file::read(&folder.join("scenario.yaml"))?;
+pub(super) fn conditions(metrics: &Metrics, ego: impl Serialize, ticks: u64) -> Value {
     let data = metrics.provenance.as_ref().map(|of| &of.data_sha256);
-    let (ego, ticks, protocol) = (&scenario["ego"]["id"], metrics.ticks, &metrics.protocol);
-    Ok(json!({"SHA-256 of the data": data, "ego": ego, "protocol": protocol, "ticks": ticks}))
+    let protocol = &metrics.protocol;
+    json!({"SHA-256 of the data": data, "ego": ego, "protocol": protocol, "ticks": ticks})
+}
+
+/// Replaces names that several runs have by their folders.
+pub fn distinguish(names: &mut [&mut String], folders: &[impl AsRef<Path>]) {
+    let all: Vec<String> = names.iter().map(|name| String::clone(name)).collect();
+    for (name, folder) in names.iter_mut().zip(folders) {
+        if all.iter().filter(|other| *other == *name).count() > 1 {
+            **name = folder.as_ref().display().to_string();
+        }
+    }
+}
+
+/// Lines about what differs in the conditions of runs, each after its name; empty where nothing does.
+pub(super) fn differences(runs: &[(&str, &Value)]) -> String {
+    let mut lines = Vec::new();
+    add_differences("", runs, &mut lines);
+    if lines.is_empty() {
+        return String::new();
+    }
+    let hint = "The precisions of these runs cannot be compared.";
+    format!("\n{}\n{hint}\n", lines.join("\n"))
+}
+
+/// Adds a line for each field of some values, one of each run, that differs.
+fn add_differences(name: &str, runs: &[(&str, &Value)], lines: &mut Vec<String>) {
+    if let Some((_, Value::Object(fields))) = runs.first() {
+        for field in fields.keys() {
+            let runs = runs.iter().map(|&(run, value)| (run, &value[field]));
+            add_differences(&format!("{name} {field}"), &Vec::from_iter(runs), lines);
+        }
+    } else if runs.windows(2).any(|pair| pair[0].1 != pair[1].1) {
+        let values = runs.iter().map(|(run, value)| format!("{run} {value}"));
+        let values: Vec<String> = values.collect();
+        lines.push(format!("Runs differ in{name}: {}", values.join(", ")));
+    }
 }
 
 impl Comparison {
@@ -73,27 +108,17 @@ impl Comparison {
     /// [`FileError`] as that of [`RunReport::read`].
     pub fn read(folders: &[impl AsRef<Path>]) -> Result<Self, FileError> {
         let runs = folders.iter().map(|folder| {
-            let report = RunReport::read(folder.as_ref())?;
-            let metrics = read_json(folder.as_ref().join(metrics::FILE))?;
-            let conditions = conditions(folder.as_ref(), &metrics)?;
+            let folder = folder.as_ref();
+            let report = RunReport::read(folder)?;
+            let metrics: Metrics = read_json(folder.join(metrics::FILE))?;
+            let scenario: Value = config_file::read(&folder.join("scenario.yaml"))?;
+            let conditions = conditions(&metrics, &scenario["ego"]["id"], metrics.ticks);
             Ok((report, metrics, conditions))
         });
-        runs.collect::<Result<_, _>>().map(Self)
-    }
-
-    /// Adds a line for each field of some values, one of each run, that differs.
-    fn add_differences(&self, name: &str, values: &[&Value], lines: &mut Vec<String>) {
-        if let Some(Value::Object(fields)) = values.first() {
-            for field in fields.keys() {
-                let values: Vec<&Value> = values.iter().map(|of| &of[field]).collect();
-                self.add_differences(&format!("{name} {field}"), &values, lines);
-            }
-        } else if values.windows(2).any(|pair| pair[0] != pair[1]) {
-            let runs = self.0.iter().zip(values);
-            let values = runs.map(|((report, ..), value)| format!("{} {value}", report.run));
-            let values: Vec<String> = values.collect();
-            lines.push(format!("Runs differ in{name}: {}", values.join(", ")));
-        }
+        let mut runs = runs.collect::<Result<Vec<_>, FileError>>()?;
+        let names = runs.iter_mut().map(|(report, ..)| &mut report.run);
+        distinguish(&mut Vec::from_iter(names), folders);
+        Ok(Self(runs))
     }
 }
 
@@ -108,14 +133,13 @@ impl fmt::Display for Comparison {
             table.row([name.to_owned()].into_iter().chain(values));
         }
         write!(f, "{table}")?;
-        let conditions: Vec<&Value> = self.0.iter().map(|(.., of)| of).collect();
-        let mut differences = Vec::new();
-        self.add_differences("", &conditions, &mut differences);
+        let runs = self.0.iter();
+        let conditions = runs.map(|(report, _, of)| (report.run.as_str(), of));
+        let differences = differences(&Vec::from_iter(conditions));
         let mut answered = self.0.iter().map(|(_, metrics, _)| metrics.answered);
         let first = answered.next();
         if !differences.is_empty() {
-            let hint = "The precisions of these runs cannot be compared.";
-            writeln!(f, "\n{}\n{hint}", differences.join("\n"))?;
+            f.write_str(&differences)?;
         } else if answered.any(|answered| Some(answered) != first) {
             let hint =
                 "Runs answered different numbers of ticks: compare \"AP@0.5 all\" and sAP@0.5.";

@@ -20,7 +20,7 @@ use support::statistics::{quantile, sorted};
 
 pub use capacity::{Capacity, Machine};
 pub use clocks::OtherClock;
-pub use comparison::Comparison;
+pub use comparison::{Comparison, distinguish};
 pub use pace::{AgentPace, RunPace};
 pub use resources::{ProcessResources, StageReport, StreamBytes};
 pub use tracks::{TrackReport, track_table};

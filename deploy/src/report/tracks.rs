@@ -4,7 +4,7 @@
 //! its tracks are judged (`tracks.jsonl`), else those that its detections give: the tracker gets what a live one would
 //! have, detections and the ego's own pose, no truth.
 
-use std::collections::{HashMap, HashSet};
+use std::collections::{BTreeSet, HashMap, HashSet};
 use std::io::{BufRead, BufReader, Read};
 use std::path::Path;
 
@@ -15,6 +15,7 @@ use protocol::{
 };
 use serde::Serialize;
 use serde::de::DeserializeOwned;
+use serde_json::Value;
 use support::bounded_file;
 use support::file_error::{AtFile, FileError};
 use terminal::text_table::{TextTable, number};
@@ -23,7 +24,9 @@ use tracking::metrics::{
 };
 use tracking::{Tracker, TrackerConfig};
 
-use crate::score::{ScenarioLine, TRACKS, TruthLine};
+use super::comparison::{conditions, differences};
+use super::read_json;
+use crate::score::{ScenarioLine, TRACKS, TruthLine, metrics};
 
 /// Longest line that is read, bytes: a result with the most boxes that a message may hold has less.
 const MAX_LINE_BYTES: u64 = 16 << 20;
@@ -52,6 +55,9 @@ pub struct TrackReport {
     /// The metrics.
     #[serde(flatten)]
     pub quality: TrackQuality,
+    /// What has to be equal in runs that are compared; `null` without `metrics.json`.
+    #[serde(skip)]
+    conditions: Value,
 }
 
 /// Scenario, ego, tick, and capture time, nanoseconds: ticks alone repeat with every lap of a loop.
@@ -107,6 +113,11 @@ impl TrackReport {
         })?;
         // Results with a line of truth were taken out on the way.
         report.without_truth = without_tick + results.len();
+        let file = folder.join(metrics::FILE);
+        if file.exists() {
+            let egos: BTreeSet<&String> = followed.iter().map(|one| &one.ego).collect();
+            report.conditions = conditions(&read_json(file)?, egos, report.ticks as u64);
+        }
         let sequences: Vec<Sequence> = followed.into_iter().map(|one| one.sequence).collect();
         report.quality = TrackQuality::of(&sequences);
         Ok(report)
@@ -270,7 +281,8 @@ fn for_each_line<T: DeserializeOwned>(
     Ok(())
 }
 
-/// A table with a row for each run, and below it a line for each count of what could not be used.
+/// A table with a row for each run, and below it lines about what differs between the runs, and a line for each count of
+/// what could not be used.
 pub fn track_table(reports: &[TrackReport]) -> String {
     let numbers = [
         "answered", "AMOTA", "AMOTP, m", "MOTA", "MOTP, m", "recall", "IDS", "FRAG", "MT", "ML",
@@ -303,14 +315,21 @@ pub fn track_table(reports: &[TrackReport]) -> String {
         ]);
     }
     let notes: String = reports.iter().flat_map(TrackReport::notes).collect();
-    format!("{table}{notes}")
+    let runs = reports.iter().map(|of| (of.run.as_str(), &of.conditions));
+    // Of a run that was interrupted nothing is known.
+    let known = runs.filter(|(_, conditions)| !conditions.is_null());
+    let differences = differences(&Vec::from_iter(known));
+    format!("{table}{differences}{notes}")
 }
 
 #[cfg(test)]
 mod tests {
+    use dataset::evaluation_protocol::EvaluationProtocol;
     use protocol::{Detection, Pose, PoseEstimate, Stamp};
 
     use super::*;
+    use crate::report::distinguish;
+    use crate::score::metrics::Metrics;
 
     const EGO: &str = "12";
 
@@ -559,6 +578,37 @@ mod tests {
             Some(10),
             "only the box without an object"
         );
+    }
+
+    #[test]
+    fn runs_under_other_conditions_are_named_by_their_folders() {
+        let folder = tempfile::tempdir().unwrap();
+        let folders = ["a", "b"].map(|name| folder.path().join(name).join("max"));
+        let mut reports = Vec::new();
+        for (run, max_agents) in folders.iter().zip([4, 7]) {
+            std::fs::create_dir_all(run).unwrap();
+            std::fs::write(run.join("detections.jsonl"), "").unwrap();
+            let line = truth(0, &[], &[]) + "\n";
+            std::fs::write(run.join("truth.jsonl"), line).unwrap();
+            let protocol = EvaluationProtocol {
+                max_agents,
+                ..EvaluationProtocol::preset("opv2v").unwrap()
+            };
+            let metrics = Metrics {
+                protocol: Some(protocol),
+                ..Metrics::default()
+            };
+            let text = serde_json::to_string(&metrics).unwrap();
+            std::fs::write(run.join(metrics::FILE), text).unwrap();
+            reports.push(TrackReport::read(run).unwrap());
+        }
+        let names = reports.iter_mut().map(|report| &mut report.run);
+        distinguish(&mut Vec::from_iter(names), &folders);
+        let text = track_table(&reports);
+        let [a, b] = folders.each_ref().map(|folder| folder.display());
+        let line = format!("\nRuns differ in protocol max_agents: {a} 4, {b} 7\n");
+        assert!(text.contains(&line), "{text}");
+        assert_eq!(text.matches("differ").count(), 1, "{text}");
     }
 
     /// A line of truth or of a result, of another tick and capture time.

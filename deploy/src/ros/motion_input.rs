@@ -5,7 +5,7 @@ use std::sync::{Arc, Mutex};
 
 use bus::{Bus, BusError, Publisher, PublisherOptions};
 use protocol::{CavId, EgoMotion, Stream, Topic};
-use ros2::{MotionType, Qos, RosName, TimedMotion};
+use ros2::{MotionType, Qos, RosName};
 use serde::Serialize;
 use support::sync::lock;
 
@@ -120,13 +120,12 @@ impl MotionInput {
 }
 
 impl Measurements {
-    fn add(&mut self, topic: &RosName, read: Option<TimedMotion>, takes_yaw_rate: bool) {
+    fn add(&mut self, topic: &RosName, read: Option<(u64, EgoMotion)>, takes_yaw_rate: bool) {
         let report = self.reports.entry(topic.to_string()).or_default();
-        let Some(read) = read else {
+        let Some((nanos, motion)) = read else {
             report.unreadable += 1;
             return;
         };
-        let (nanos, motion) = (read.capture_nanos, read.motion);
         report.read += 1;
         if let Some(speed_mps) = motion.speed_mps {
             report.out_of_order += self.speed_mps.add(nanos, speed_mps);

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use bus::bounded_queue::{BoundedQueue, Pop};
 use bus::shutdown::Stop;
-use bus::{Bus, LivelinessEvent, PassiveSubscriber, RawMessage, Result};
+use bus::{Bus, PassiveSubscriber, RawMessage, Result};
 use protocol::{CavId, KeyExpr, Kind, Limits, Message, Role, Stream, Topic, wire};
 use ros2::{FrameNames, RosTopic, Translator, VehicleTopic};
 use serde::Serialize;
@@ -81,7 +81,9 @@ pub fn run(
     let watched = [Role::Agent, Role::Ego].map(|role| {
         let members = Arc::clone(&members);
         // A change beyond those that fit is not noticed: the topics appear with their first message.
-        bus.watch(role, move |event| drop(members.push((), event)))
+        bus.watch(role, move |cav, is_there| {
+            drop(members.push((), (role, cav, is_there)));
+        })
     });
     let _watched = watched.into_iter().collect::<Result<Vec<_>, _>>()?;
     let frames = RobotFrames::of(options.robots(), options.mount);
@@ -185,12 +187,12 @@ impl<'scope, 'env> RunFollower<'scope, 'env> {
     fn publish_all(
         &mut self,
         subscriber: &PassiveSubscriber,
-        members: &BoundedQueue<(), LivelinessEvent>,
+        members: &BoundedQueue<(), (Role, CavId, bool)>,
     ) -> Result<()> {
         loop {
             // All changes first, so that a topic is there before its first message.
-            while let Pop::Item((), event) = members.take(Some(Instant::now())) {
-                self.note(event)?;
+            while let Pop::Item((), (role, cav, is_there)) = members.take(Some(Instant::now())) {
+                self.note(role, &cav, is_there)?;
             }
             // The transforms that robots have got since, and the fixed ones if they have changed.
             for (nanos, frame) in self.frames.odometry_in_map() {
@@ -206,26 +208,24 @@ impl<'scope, 'env> RunFollower<'scope, 'env> {
     }
 
     /// A process of a vehicle has joined or left: its topics appear, or disappear.
-    fn note(&mut self, event: LivelinessEvent) -> Result<()> {
-        use LivelinessEvent::{Joined, Left};
-        use Role::Agent;
-        match event {
-            Joined { role: Agent, cav } => {
+    fn note(&mut self, role: Role, cav: &CavId, is_there: bool) -> Result<()> {
+        match (role, is_there) {
+            (Role::Agent, true) => {
                 self.agents.insert(cav.clone());
-                self.declare_all(&cav, &OF_AGENT)?;
+                self.declare_all(cav, &OF_AGENT)?;
                 if !self.options.no_points {
-                    self.forward_sweeps(&cav)?;
+                    self.forward_sweeps(cav)?;
                 }
             }
-            Joined { cav, .. } => self.declare_all(&cav, &OF_EGO)?,
-            Left { role: Agent, cav } => {
-                self.agents.remove(&cav);
-                self.withdraw(&cav, &OF_AGENT);
-                if let Some(forwarding) = self.sweeps.remove(&cav) {
+            (_, true) => self.declare_all(cav, &OF_EGO)?,
+            (Role::Agent, false) => {
+                self.agents.remove(cav);
+                self.withdraw(cav, &OF_AGENT);
+                if let Some(forwarding) = self.sweeps.remove(cav) {
                     forwarding.end();
                 }
             }
-            Left { cav, .. } => self.withdraw(&cav, &OF_EGO),
+            (_, false) => self.withdraw(cav, &OF_EGO),
         }
         Ok(())
     }

@@ -139,7 +139,7 @@ impl FrameScores {
 
     /// Average precision over the answered ticks, ordered by score over all frames, and ordered by frame.
     pub fn average_precision(&self) -> [ByIou; 2] {
-        [Ordering::Global, Ordering::Frame].map(|by| by_iou(self.scorer.tallies(), by))
+        [Ordering::Global, Ordering::Frame].map(|by| by_iou(&self.scorer.tallies, by))
     }
 
     /// Average precision over the answered ticks by distance and by class, of the parts that have objects, ordered by
@@ -147,7 +147,7 @@ impl FrameScores {
     pub fn average_precision_by_part(&self) -> [BTreeMap<String, PartPrecision>; 2] {
         let mut by_part = [BTreeMap::new(), BTreeMap::new()];
         let [distances, classes] = &mut by_part;
-        for (part, tallies) in self.scorer.parts() {
+        for (part, tallies) in &self.scorer.parts {
             let objects = tallies.first().map_or(0, |tally| tally.objects);
             if objects > 0 {
                 let precision = PartPrecision {
@@ -167,7 +167,7 @@ impl FrameScores {
     /// made non-increasing in recall, as for [`Self::average_precision`].
     pub fn precision_recall_csv(&self) -> String {
         let mut text = CsvText::new("iou,score,recall,precision");
-        for tally in self.scorer.tallies() {
+        for tally in &self.scorer.tallies {
             let curve = tally.curve(Ordering::Global);
             let mut scores: Vec<f32> = tally.matched.iter().map(|matched| matched.score).collect();
             scores.sort_by(|a, b| b.total_cmp(a));

@@ -101,13 +101,13 @@ impl LivePrecision {
 
     /// Average precision ordered by score; a tick without a result is a frame without detections.
     pub(super) fn unanswered_empty(&self) -> ByIou {
-        by_iou(self.all_ticks.tallies(), Ordering::Global)
+        by_iou(&self.all_ticks.tallies, Ordering::Global)
     }
 
     /// Streaming average precision, ordered by score; `None` if results have no time of publication.
     pub(super) fn streaming(&self) -> Option<ByIou> {
         let is_timed = self.ticks > 0 && !self.is_untimed;
-        is_timed.then(|| by_iou(self.streaming.tallies(), Ordering::Global))
+        is_timed.then(|| by_iou(&self.streaming.tallies, Ordering::Global))
     }
 
     /// The detections of the newest sweep that were published by a tick, moved to the ego's pose at that tick, behind
@@ -251,7 +251,7 @@ mod tests {
             live.add(tick, truth, detections, Some(began_nanos));
         }
         assert_eq!(
-            live.streaming.tallies()[0].matched,
+            live.streaming.tallies[0].matched,
             [],
             "it is behind the area at the second tick"
         );

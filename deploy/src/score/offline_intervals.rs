@@ -7,7 +7,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::{Arc, Mutex};
 
-use bus::{Bus, BusError, LivelinessEvent, Subscription, process_id};
+use bus::{Bus, BusError, Subscription, process_id};
 use protocol::{Account, Role, Topic};
 use support::sync::lock;
 
@@ -29,16 +29,14 @@ impl OfflineIntervals {
         let departed = Arc::<Mutex<BTreeMap<_, _>>>::default();
         let watches = ROLES.into_iter().map(|role| {
             let departed = Arc::clone(&departed);
-            bus.watch(role, move |event| match event {
-                LivelinessEvent::Left { role, cav } => {
-                    let name = process_id(role, &cav).to_string();
-                    lock(&departed).entry(name).or_insert(false);
-                }
-                LivelinessEvent::Joined { role, cav } => {
-                    let name = process_id(role, &cav).to_string();
-                    lock(&departed)
-                        .entry(name)
-                        .and_modify(|rejoined| *rejoined = true);
+            bus.watch(role, move |cav, is_there| {
+                let name = process_id(role, &cav).to_string();
+                let mut departed = lock(&departed);
+                let process = departed.entry(name);
+                if is_there {
+                    process.and_modify(|rejoined| *rejoined = true);
+                } else {
+                    process.or_insert(false);
                 }
             })
         });

@@ -36,7 +36,7 @@ impl FrameCounts {
     pub(super) fn of(scorer: &mut Scorer, detections: &[Detection], truth: &GroundTruth) -> Self {
         let verdicts = scorer.add(detections, truth);
         let mut counts = Self::default();
-        let all = scorer.tallies().iter().zip(&verdicts);
+        let all = scorer.tallies.iter().zip(&verdicts);
         // Compared exactly, as thresholds are constants and none is computed.
         let at_iou = all.filter(|(tally, _)| tally.iou_threshold == FOUND_IOU);
         for verdict in at_iou.flat_map(|(_, verdicts)| verdicts) {

@@ -121,7 +121,7 @@ impl Judge {
 
     /// Average precision of the frames so far, in the order of the protocol; `None` without an object.
     pub(super) fn average_precision(&self) -> Option<f64> {
-        let tally = self.scorer.tallies().first()?;
+        let tally = self.scorer.tallies.first()?;
         let ordering = Ordering::of(self.protocol.as_ref());
         tally.curve(ordering).average_precision
     }

@@ -41,7 +41,7 @@ fn fuse(criterion: &mut Criterion) {
         } in cases(&config)
         {
             // The newest of all first, in the order that the ego uses.
-            let entries = (0..stage.requirements().history.frames)
+            let entries = (0..stage.requirements.history.frames)
                 .flat_map(|step| (0..agents).map(move |agent| (step, agent)));
             let facts: Vec<_> = entries.map(|(step, agent)| entry(step, agent)).collect();
             let size = [facts.len() as i64, shape[0], shape[1], shape[2]];

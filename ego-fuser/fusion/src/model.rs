@@ -25,13 +25,13 @@ use tch::{Device, Kind, TchError, Tensor};
 use crate::box_input::{self, PlacedBox};
 use crate::method::{Method, UnknownMethod};
 use crate::own::OwnConfig;
-use crate::targets::{AnchorGridError, TargetAssigner};
+use crate::targets::TargetAssigner;
 use crate::warp::WarpError;
 use crate::where2comm::most_confident;
 use crate::{FUSION_KEY, FusionConfig, FusionOutput, MapMetadata, ReceivedMaps, channel_mixing};
 
+pub use stage::FusionStage;
 use stage::{FUSION_PREFIX, stored_config};
-pub use stage::{FusionStage, StageError};
 
 /// Error of building, loading or running a model.
 #[derive(Debug, thiserror::Error)]
@@ -90,11 +90,13 @@ pub struct CooperativeModel {
     pub method: Method,
     /// Every variable, by the names of the weights file.
     pub variables: VarStore,
-    network: PointPillars,
+    /// The encoder and head.
+    pub network: PointPillars,
     anchors: Anchors,
-    fusion: FusionStage,
-    /// Refinement of the boxes that a vehicle sends.
-    refinement: Option<BoxRefinement>,
+    /// The fusion stage.
+    pub fusion: FusionStage,
+    /// Refinement of the boxes that a vehicle sends, if it has one.
+    pub refinement: Option<BoxRefinement>,
 }
 
 impl CooperativeModel {
@@ -187,11 +189,6 @@ impl CooperativeModel {
         self.refinement = Some(BoxRefinement::new(&root, &self.network.config));
     }
 
-    /// Refinement of the boxes that a vehicle sends, if it has one.
-    pub fn refinement(&self) -> Option<&BoxRefinement> {
-        self.refinement.as_ref()
-    }
-
     /// Freezes everything but the box input and the refinement of boxes, which are made if there are none.
     ///
     /// # Errors
@@ -230,11 +227,6 @@ impl CooperativeModel {
         &self.network.config
     }
 
-    /// The encoder and head.
-    pub fn network(&self) -> &PointPillars {
-        &self.network
-    }
-
     /// Sets the precision of the convolutions.
     pub fn set_precision(&mut self, precision: ComputePrecision) {
         self.network.compute = precision.kind();
@@ -243,11 +235,6 @@ impl CooperativeModel {
     /// Device of the variables.
     pub fn device(&self) -> Device {
         self.variables.device()
-    }
-
-    /// The fusion stage.
-    pub fn fusion(&self) -> &FusionStage {
-        &self.fusion
     }
 
     /// The forward pass of a training step: all views are encoded together, then fused sample by sample.
@@ -348,7 +335,7 @@ impl CooperativeModel {
     /// training a random share of the most confident cells, so that every threshold is learnt. The ego keeps all of its
     /// own.
     fn sent(&self, features: &Tensor, train: bool) -> Result<Option<Tensor>, TchError> {
-        let selects = train && self.fusion.requirements().partial_maps_in_training;
+        let selects = train && self.fusion.requirements.partial_maps_in_training;
         if !selects || features.size4()?.0 < 2 {
             return Ok(None);
         }
@@ -385,13 +372,7 @@ impl CooperativeModel {
     }
 
     /// The assigner of a frame's targets to the anchors of the head.
-    ///
-    /// # Errors
-    /// [`AnchorGridError`] when the configuration has no anchors.
-    pub fn assigner(&self) -> Result<TargetAssigner, AnchorGridError> {
-        let anchors = &self.anchors;
-        let boxes = (0..anchors.len()).map(|index| anchors.box_at(index));
-        let shape = [anchors.y_m.len(), anchors.x_m.len(), anchors.yaws_rad.len()];
-        TargetAssigner::new(boxes.collect(), shape)
+    pub fn assigner(&self) -> TargetAssigner {
+        TargetAssigner::new(self.anchors.clone())
     }
 }

@@ -5,6 +5,7 @@
 //! computed in `f32` in the reference's order of operations, because anchors that lie completely inside an object tie,
 //! and rounding decides which of them is its best.
 
+use perception::boxes::anchors::Anchors;
 use protocol::Box3d;
 
 /// Numbers of one box that the head predicts: x, y, z, h, w, l, yaw.
@@ -35,84 +36,22 @@ pub struct Labels {
     pub unassigned: Vec<usize>,
 }
 
-/// Error of the anchors of a head.
-#[derive(Debug, Clone, PartialEq, thiserror::Error)]
-pub enum AnchorGridError {
-    /// The number of anchors is not the product of the shape.
-    #[error("{found} anchors do not fill a grid of {height} x {width} x {per_cell}")]
-    Count {
-        /// Anchors given.
-        found: usize,
-        /// Rows.
-        height: usize,
-        /// Columns.
-        width: usize,
-        /// Anchors of a cell.
-        per_cell: usize,
-    },
-    /// Centres do not increase with row and column, so objects cannot be looked up; holds the flat index of the first
-    /// anchor that breaks the order.
-    #[error(
-        "anchor {0} breaks the order of the grid: x must increase with the column only, y with the row only"
-    )]
-    NotSeparable(usize),
-}
-
 /// Assigns the objects of a frame to the anchors of a head.
 #[derive(Debug, Clone)]
 pub struct TargetAssigner {
-    anchors: Vec<Box3d>,
+    anchors: Anchors,
+    /// The box around each anchor, in the order of their indices.
     standing: Vec<Standing>,
-    column_x: Vec<f64>,
-    row_y: Vec<f64>,
-    per_cell: usize,
-    /// Largest half extent of an anchor along an axis, metres.
-    reach: f64,
 }
 
 impl TargetAssigner {
-    /// Prepares `anchors`, flat in the order row (y), column (x), anchor of the cell; `shape` is `[H, W, A]`.
-    ///
-    /// # Errors
-    /// [`AnchorGridError`] when the anchors do not fill the shape or are not on a grid.
-    pub fn new(anchors: Vec<Box3d>, shape: [usize; 3]) -> Result<Self, AnchorGridError> {
-        let [height, width, per_cell] = shape;
-        if anchors.len() != height * width * per_cell || anchors.is_empty() {
-            return Err(AnchorGridError::Count {
-                found: anchors.len(),
-                height,
-                width,
-                per_cell,
-            });
-        }
-        let column_x: Vec<f64> = (0..width)
-            .map(|column| anchors[column * per_cell].center_m[0])
-            .collect();
-        let row_y: Vec<f64> = (0..height)
-            .map(|row| anchors[row * width * per_cell].center_m[1])
-            .collect();
-        let off_lattice = anchors.iter().enumerate().position(|(index, anchor)| {
-            let (row, column) = (index / per_cell / width, index / per_cell % width);
-            anchor.center_m[0] != column_x[column] || anchor.center_m[1] != row_y[row]
-        });
-        if let Some(index) = off_lattice {
-            return Err(AnchorGridError::NotSeparable(index));
-        }
-        if !column_x.is_sorted_by(|a, b| a < b) || !row_y.is_sorted_by(|a, b| a < b) {
-            return Err(AnchorGridError::NotSeparable(0));
-        }
-        let reach = anchors
-            .iter()
-            .map(|anchor| anchor.size_m[0].hypot(anchor.size_m[1]) / 2.0)
-            .fold(0.0, f64::max);
-        Ok(Self {
-            standing: anchors.iter().map(Standing::of).collect(),
+    /// Prepares the anchors, whose columns and rows increase.
+    pub fn new(anchors: Anchors) -> Self {
+        let boxes = (0..anchors.len()).map(|index| anchors.box_at(index));
+        Self {
+            standing: boxes.map(|anchor| Standing::of(&anchor)).collect(),
             anchors,
-            column_x,
-            row_y,
-            per_cell,
-            reach,
-        })
+        }
     }
 
     /// Targets of the objects of one frame, boxes in the frame of the anchors.
@@ -152,7 +91,7 @@ impl TargetAssigner {
         };
         for (anchor, (&owner, &near)) in owner.iter().zip(&near).enumerate() {
             if owner != FREE {
-                let code = encode(&objects[owner as usize], &self.anchors[anchor]);
+                let code = encode(&objects[owner as usize], &self.anchors.box_at(anchor));
                 labels.positives.push(Positive { anchor, code });
             } else if near {
                 labels.unassigned.push(anchor);
@@ -163,16 +102,20 @@ impl TargetAssigner {
 
     /// Visits the anchors that can overlap `object`, by rising index.
     fn for_each_near(&self, object: &Box3d, mut visit: impl FnMut(usize)) {
+        let Anchors { x_m, y_m, .. } = &self.anchors;
+        let [length_m, width_m, _] = self.anchors.size_lwh_m;
         // The added metre, and a margin for the rounding to f32.
-        let reach = self.reach + object.size_m[0].hypot(object.size_m[1]) / 2.0 + 1.01;
-        let [columns, rows] = [(&self.column_x, 0), (&self.row_y, 1)].map(|(centers, axis)| {
+        let reach =
+            length_m.hypot(width_m) / 2.0 + object.size_m[0].hypot(object.size_m[1]) / 2.0 + 1.01;
+        let [columns, rows] = [(x_m, 0), (y_m, 1)].map(|(centers, axis)| {
             let middle = object.center_m[axis];
             centers.partition_point(|&at| at < middle - reach)
                 ..centers.partition_point(|&at| at <= middle + reach)
         });
+        let per_cell = self.anchors.yaws_rad.len();
         for row in rows {
-            let first = (row * self.column_x.len() + columns.start) * self.per_cell;
-            (first..first + columns.len() * self.per_cell).for_each(&mut visit);
+            let first = (row * x_m.len() + columns.start) * per_cell;
+            (first..first + columns.len() * per_cell).for_each(&mut visit);
         }
     }
 }
@@ -252,27 +195,22 @@ mod tests {
 
     const CAR: [f64; 3] = [3.9, 1.6, 1.56];
 
-    fn anchor_grid(height: usize, width: usize) -> Vec<Box3d> {
-        (0..height * width * 2)
-            .map(|index| {
-                let (row, column) = (index / 2 / width, index / 2 % width);
-                Box3d {
-                    center_m: [column as f64 * 0.8, row as f64 * 0.8, -1.0],
-                    size_m: CAR,
-                    heading_rad: if index % 2 == 0 { 0.0 } else { FRAC_PI_2 },
-                }
-            })
-            .collect()
-    }
-
     fn assigner() -> TargetAssigner {
-        TargetAssigner::new(anchor_grid(20, 30), [20, 30, 2]).unwrap()
+        let [x_m, y_m] =
+            [30_u32, 20].map(|count| (0..count).map(|place| f64::from(place) * 0.8).collect());
+        TargetAssigner::new(Anchors {
+            x_m,
+            y_m,
+            z_m: -1.0,
+            size_lwh_m: CAR,
+            yaws_rad: vec![0.0, FRAC_PI_2],
+        })
     }
 
     #[test]
     fn an_object_on_an_anchor_has_nothing_to_regress_there() {
-        let anchors = anchor_grid(20, 30);
-        let labels = assigner().assign(&[anchors[777]]);
+        let assigner = assigner();
+        let labels = assigner.assign(&[assigner.anchors.box_at(777)]);
         let at = labels
             .positives
             .iter()
@@ -343,15 +281,5 @@ mod tests {
             heading_rad: 0.0,
         };
         assert!(assigner().assign(&[far]).positives.is_empty());
-    }
-
-    #[test]
-    fn anchors_off_a_grid_are_rejected() {
-        let mut anchors = anchor_grid(4, 5);
-        let error = TargetAssigner::new(anchors.clone(), [4, 4, 2]).unwrap_err();
-        assert!(matches!(error, AnchorGridError::Count { found: 40, .. }));
-        anchors[13].center_m[0] += 0.1;
-        let error = TargetAssigner::new(anchors, [4, 5, 2]).unwrap_err();
-        assert_eq!(error, AnchorGridError::NotSeparable(13));
     }
 }

@@ -20,6 +20,7 @@ use fusion::method::Method;
 use fusion::model::FusionStage;
 use fusion::planar_pose::moved;
 use fusion::{MapMetadata, ReceivedMaps};
+use training::samples::PoseOffset;
 
 /// Reason why nothing is measured.
 #[derive(Debug, thiserror::Error)]
@@ -182,9 +183,7 @@ impl AlignmentMeter {
 
 /// Distance in the plane, metres, and angle, degrees.
 fn error(truth: &Pose, found: &Pose) -> [f64; 2] {
-    let [dx, dy] = [0, 1].map(|axis| found.translation_m[axis] - truth.translation_m[axis]);
-    let (sin, cos) = (found.yaw_rad() - truth.yaw_rad()).sin_cos();
-    let turn_rad = sin.atan2(cos);
+    let PoseOffset([dx, dy, turn_rad]) = PoseOffset::between(found, truth);
     [dx.hypot(dy), turn_rad.abs().to_degrees()]
 }
 

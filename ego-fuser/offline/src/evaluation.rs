@@ -74,16 +74,20 @@ impl EvaluatedFrame {
 pub struct Evaluator {
     setup: Setup,
     weights: Weights,
-    ego: Ego,
-    rule: GroundTruthRule,
+    /// The ego's pipeline.
+    pub ego: Ego,
+    /// Rule for the objects that count.
+    pub rule: GroundTruthRule,
     maps: Option<MapSource>,
     /// Processes that run the vehicles' pipelines; absent: this process.
     remote: Option<RemotePool>,
-    ledger: Ledger,
-    /// Data that could not be used.
-    left_out: LeftOut,
-    /// Bytes of all messages that neighbours handed to the link.
-    sent_bytes: u64,
+    /// The accounting of all messages on the link so far; empty without a link emulation.
+    pub ledger: Ledger,
+    /// Data that could not be used so far.
+    pub left_out: LeftOut,
+    /// Bytes of all messages that neighbours handed to the link so far, poses and headers included; 0 without a link
+    /// emulation.
+    pub sent_bytes: u64,
 }
 
 impl Evaluator {
@@ -128,17 +132,6 @@ impl Evaluator {
         }
     }
 
-    /// The accounting of all messages on the link so far; empty without a link emulation.
-    pub fn ledger(&self) -> &Ledger {
-        &self.ledger
-    }
-
-    /// Bytes of all messages that neighbours handed to the link so far, poses and headers included; 0 without a link
-    /// emulation.
-    pub fn sent_bytes(&self) -> u64 {
-        self.sent_bytes
-    }
-
     /// The same with maps that its encoder computed before. Maps that are stored at least as exactly as in messages give
     /// the same messages; boxes of single vehicles (`none`, `late`) are the same only if they are kept in 32 bits.
     pub fn with_maps(mut self, maps: MapSource) -> Self {
@@ -146,25 +139,10 @@ impl Evaluator {
         self
     }
 
-    /// The ego's pipeline.
-    pub fn ego(&self) -> &Ego {
-        &self.ego
-    }
-
-    /// The ego's pipeline, to change it.
-    pub fn ego_mut(&mut self) -> &mut Ego {
-        &mut self.ego
-    }
-
     /// The protocol with the ground-truth rule that applies to this network; absent where none was configured.
     pub fn protocol(&self) -> Option<EvaluationProtocol> {
         let protocol = self.setup.protocol.as_ref()?;
         Some(protocol.within(self.ego.detector().config().lidar_range_m))
-    }
-
-    /// Rule for the objects that count.
-    pub fn rule(&self) -> &GroundTruthRule {
-        &self.rule
     }
 
     /// Runs over a scenario; `on_frame` may end it. Frames that cannot be read are left out and counted

@@ -46,11 +46,11 @@ pub fn search_scales(
     setup.models.precision = precision;
     setup.models.weights = weights.to_owned();
     let mut evaluator = Evaluator::new(setup)?;
-    evaluator.ego_mut().fusion_mut().start_scale_search();
+    evaluator.ego.fusion_mut().start_scale_search();
     for scenario in scenarios {
         let _ = evaluator.run(scenario, &mut |_| ControlFlow::Continue(()))?;
     }
-    if let Some(fusion) = evaluator.ego_mut().fusion_mut().take_scale_search() {
+    if let Some(fusion) = evaluator.ego.fusion_mut().take_scale_search() {
         search.merge(fusion);
     }
     Ok(search.scales())

@@ -5,13 +5,12 @@ use perception::weights::FileError;
 use tch::TchError;
 
 use fusion::method::UnknownMethod;
-use fusion::model::StageError;
 use fusion::warp::WarpError;
 
 /// Reason why the ego has no result at all. A faulty message of a neighbour never leads here.
 #[derive(Debug, thiserror::Error)]
 pub enum EgoError {
-    /// The weights are not readable.
+    /// The weights are not readable, or the fusion does not fit them.
     #[error(transparent)]
     Weights(#[from] FileError),
     /// The detector reported an error.
@@ -20,18 +19,12 @@ pub enum EgoError {
     /// The weights name a method that is not known.
     #[error(transparent)]
     Method(#[from] UnknownMethod),
-    /// The fusion does not fit the weights.
-    #[error(transparent)]
-    Fusion(#[from] StageError),
     /// Own maps cannot be aligned.
     #[error(transparent)]
     Warp(#[from] WarpError),
-    /// The ego's own view does not have the content that the method needs: the method, and both.
-    #[error("method {0}")]
-    OwnContent(String),
-    /// The ego's own map is of another network: channels and BEV grid found, and those of the network.
-    #[error("the ego's own map is {0}")]
-    OwnMap(String),
+    /// The ego's own view does not have the content that the method needs, or its map is of another network: both.
+    #[error("{0}")]
+    OwnView(String),
     /// The tensor library reported an error.
     #[error("fusion: {0}")]
     Torch(#[from] TchError),

@@ -29,7 +29,7 @@ const FOUND_M: f64 = 0.7;
 pub(super) struct LatencyCompensation {
     of_cav: BTreeMap<CavId, FollowedSender>,
     /// Messages whose velocities were not taken.
-    refused: usize,
+    pub(super) refused: usize,
 }
 
 #[derive(Debug)]
@@ -60,22 +60,12 @@ impl LatencyCompensation {
         })
     }
 
-    /// Number of messages whose velocities were not taken, since the last call.
-    pub(super) fn take_refused(&mut self) -> usize {
-        std::mem::take(&mut self.refused)
-    }
-
     /// Removes the tracks of neighbours that have not sent for long.
     pub(super) fn forget_absent(&mut self, now_nanos: u64) {
         self.of_cav.retain(|_, followed| {
             let sent_nanos = followed.capture_nanos;
             sent_nanos.is_none_or(|sent| now_nanos.abs_diff(sent) <= FORGOTTEN_NANOS)
         });
-    }
-
-    /// Removes all tracks: another scene begins.
-    pub(super) fn clear(&mut self) {
-        self.of_cav.clear();
     }
 }
 
@@ -279,7 +269,7 @@ mod tests {
             "nothing contradicts it"
         );
         assert!((1..10).all(|tick| carried_by_m(tick) < 0.1));
-        assert_eq!(compensation.take_refused(), 9);
+        assert_eq!(compensation.refused, 9);
     }
 
     #[test]

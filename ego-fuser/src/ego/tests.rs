@@ -1,3 +1,5 @@
+use std::path::Path;
+
 use agent::agent::{Agent, AgentInput};
 use localization::pose_source::RecordedPose;
 use perception::model_config::DetectorConfig;
@@ -494,10 +496,7 @@ fn maps_of_another_network_are_left_out_and_named_where_they_are_the_egos_own() 
         content: Content::Boxes(vec![]),
         ..own.clone()
     };
-    assert!(matches!(
-        ego.detect(&boxes, &[]),
-        Err(EgoError::OwnContent { .. })
-    ));
+    assert!(matches!(ego.detect(&boxes, &[]), Err(EgoError::OwnView(_))));
     assert_eq!(
         ego.detect(&own, &[boxes]).unwrap().skipped,
         [(0, Some(DropReason::Shape))]
@@ -580,7 +579,7 @@ fn aligned_here<'a>(own: &'a View, other: &'a View) -> [Aligned<'a>; 2] {
 #[test]
 fn maps_of_earlier_frames_are_moved_by_the_egos_motion_and_come_in_once() {
     let mut ego = Ego::new(detector(), Method::PASTAT).unwrap();
-    assert_eq!(ego.fusion.requirements().history.frames, 3);
+    assert_eq!(ego.fusion.requirements.history.frames, 3);
     let other = view("b", near(), Method::PASTAT, 0.15);
     let (first, second) = (moving_view(0, 0.0), moving_view(1, 2.0));
     ego.detect(&first, std::slice::from_ref(&other)).unwrap();
@@ -624,7 +623,7 @@ fn maps_of_earlier_frames_are_moved_by_the_egos_motion_and_come_in_once() {
 /// The ego of a model that is written to a file.
 fn ego_of_file(file: &Path, model: &CooperativeModel) -> Ego {
     save(file, &model.variables, &model.about(), Precision::Single).unwrap();
-    Ego::load(file, None, Device::Cpu).unwrap()
+    Ego::from_weights(&Weights::load(file).unwrap(), None, Device::Cpu).unwrap()
 }
 
 /// Egos of `method` from files of the same weights, without and with a box input.

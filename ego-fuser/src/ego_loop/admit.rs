@@ -8,7 +8,8 @@ use crate::capture_clock::SweepTime;
 use crate::ego::{Content, Ego, View};
 use crate::pairing::Dropped;
 
-/// Largest lead of a neighbour's message over the newest of the ego's own, nanoseconds: its computer may be faster.
+/// Largest lead of a neighbour's message over the newest of the ego's own, nanoseconds, beside the time since that arrived:
+/// its computer may be faster.
 const MAX_AHEAD_NANOS: u64 = 2_000_000_000;
 
 /// Reason why a message is not decoded.
@@ -42,8 +43,8 @@ impl EgoLoop {
         let is_boxes = header.kind == Kind::Boxes && self.reads_boxes && *cav != self.cav;
         let stream = if is_boxes { Stream::Boxes } else { self.stream };
         if *cav != self.cav {
-            self.dated(cav, stream, header.stamp.capture_nanos)
-                .map_err(Refusal::Unneeded)?;
+            let times = [header.stamp.capture_nanos, reception.arrived_nanos];
+            self.dated(cav, stream, times).map_err(Refusal::Unneeded)?;
         }
         let (pose, content) = match stream {
             Stream::Boxes => {
@@ -85,7 +86,7 @@ impl EgoLoop {
     /// Takes a message in: the own agent's begins a frame, a neighbour's is queued for one.
     pub(super) fn take_in(&mut self, ego: &mut Ego, mut message: Message, now_nanos: u64) {
         let cav = message.view.cav.clone();
-        let stated_nanos = message.view.capture_nanos;
+        let times = [message.view.capture_nanos, message.reception.arrived_nanos];
         self.waits.received(&cav, now_nanos);
         if cav == self.cav {
             return self.begin(ego, message, now_nanos);
@@ -93,13 +94,13 @@ impl EgoLoop {
         let source = (cav.clone(), message.view.content.exchange().stream());
         self.note_stream(&cav, source.1);
         // From here on the capture time is on the clock of the ego.
-        match self.dated(&cav, source.1, stated_nanos) {
+        match self.dated(&cav, source.1, times) {
             Ok(capture_nanos) => message.view.capture_nanos = capture_nanos,
             Err(reason) => return self.drop_message(source, reason),
         }
         // A map that comes after the ego's next sweep is no reason to wait for the next one.
-        let lead_nanos = self.pairing.max_lead_nanos();
-        let latest_nanos = message.view.capture_nanos.saturating_add(lead_nanos);
+        let capture_nanos = message.view.capture_nanos;
+        let latest_nanos = capture_nanos.saturating_add(self.pairing.lead_nanos);
         if source.1 == self.stream && self.own_nanos.is_none_or(|own| own <= latest_nanos) {
             self.late_maps.reset(&cav);
         }
@@ -107,7 +108,6 @@ impl EgoLoop {
             self.clock_offsets_s.insert(cav.clone(), offset_s);
         }
         self.silence.reset(&cav);
-        let capture_nanos = message.view.capture_nanos;
         if let Some(lost) = self.pairing.insert(&source, capture_nanos, message) {
             self.drop_lost(lost);
         }
@@ -128,15 +128,15 @@ impl EgoLoop {
                 .limit_lead(capture_nanos.saturating_sub(own_nanos));
         }
         self.keep_time(ego, capture_nanos);
+        self.own_arrived_nanos = message.reception.arrived_nanos;
         // In the inbox, while another frame was fused, or behind one that waits for its neighbours.
         let waited_nanos = match self.frames.is_empty() {
             true => now_nanos.saturating_sub(message.reception.arrived_nanos),
             false => u64::MAX,
         };
-        if self.options.sets_pace
-            && let Some(pace) = self.pace.judge(capture_nanos, waited_nanos, now_nanos)
-        {
-            self.outputs.push(Output::Pace(pace));
+        if self.options.sets_pace {
+            let pace = self.pace.judge(capture_nanos, waited_nanos, now_nanos);
+            self.outputs.extend(pace.map(Output::Pace));
         }
         self.frames.push_back(OwnFrame {
             agent_frame: message.sequence,
@@ -146,12 +146,14 @@ impl EgoLoop {
         });
     }
 
-    /// Capture time of a neighbour's message on the ego's clock, nanoseconds.
+    /// Capture time of a neighbour's message on the ego's clock, nanoseconds, of the stated one and the arrival.
     ///
     /// # Errors
     /// Reason to drop it: it is of another network; its clock is unsteady; it is in the future, later than the ego's own
-    /// sweeps by more than its own agent may lag behind; or it is so old that no frame of the ego will use it.
-    fn dated(&self, cav: &CavId, stream: Stream, stated_nanos: u64) -> Result<u64, DropReason> {
+    /// sweeps by more than its own agent may lag behind and the time since the newest of them; or it is so old that no frame
+    /// of the ego will use it.
+    fn dated(&self, cav: &CavId, stream: Stream, times: [u64; 2]) -> Result<u64, DropReason> {
+        let [stated_nanos, arrived_nanos] = times;
         if stream == self.stream && self.models.is_other(cav) {
             return Err(DropReason::Shape);
         }
@@ -163,7 +165,10 @@ impl EgoLoop {
         // A frame that still waits may use what is too old for the newest.
         let front = self.frames.front();
         let oldest = front.map_or(newest, |frame| frame.view.capture_nanos);
-        if capture_nanos > newest.saturating_add(MAX_AHEAD_NANOS) {
+        // After a gap in a recording, which takes its time, the neighbour's map may be the first.
+        let passed_nanos = arrived_nanos.saturating_sub(self.own_arrived_nanos);
+        let ahead_nanos = passed_nanos.saturating_add(MAX_AHEAD_NANOS);
+        if capture_nanos > newest.saturating_add(ahead_nanos) {
             Err(DropReason::Future)
         } else if capture_nanos.saturating_add(self.options.pairing.max_age_nanos) < oldest {
             Err(DropReason::Stale)
@@ -179,11 +184,8 @@ impl EgoLoop {
         // An own sweep that is older by less than the largest age is no restart.
         if self.own_nanos.is_some_and(|own| latest_nanos < own) {
             tracing::info!(capture_nanos, "the scene has restarted");
-            for source in self.pairing.senders() {
-                // A neighbour may restart before the ego: its first messages after that stay.
-                let gone = self
-                    .pairing
-                    .turn_back(&source, capture_nanos, MAX_AHEAD_NANOS);
+            // A neighbour may restart before the ego: its first messages after that stay.
+            for (source, gone) in self.pairing.turn_back(capture_nanos, MAX_AHEAD_NANOS) {
                 self.drop_messages(&source, gone, DropReason::Stale);
             }
             self.fused_nanos.clear();
@@ -278,8 +280,7 @@ impl EgoLoop {
     }
 
     fn drop_messages(&mut self, source: &Source, count: usize, reason: DropReason) {
-        for _ in 0..count {
-            self.drop_message(source.clone(), reason);
-        }
+        let dropped = (0..count).map(|_| Output::Counted(source.clone(), Some(reason)));
+        self.outputs.extend(dropped);
     }
 }

@@ -16,7 +16,7 @@ mod waits;
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::time::Duration;
 
-use protocol::{CavId, DropReason, Stream};
+use protocol::{CavId, Stream};
 use serde::Serialize;
 
 use crate::capture_clock::CaptureClocks;
@@ -121,8 +121,10 @@ pub struct EgoLoop {
     tracker: Option<Tracker>,
     /// Capture time of the ego's newest sweep, nanoseconds.
     own_nanos: Option<u64>,
+    /// Arrival of its message, nanoseconds.
+    own_arrived_nanos: u64,
     ended: BTreeSet<CavId>,
-    waits: Waits,
+    pub(crate) waits: Waits,
     /// Time at which the loop ends at the latest, after the own agent's end.
     ends_nanos: Option<u64>,
     is_finished: bool,
@@ -159,6 +161,7 @@ impl EgoLoop {
             pace: PaceControl::new(),
             tracker: options.tracks.then(|| Tracker::new(tracker_config)),
             own_nanos: None,
+            own_arrived_nanos: 0,
             ended: BTreeSet::new(),
             ends_nanos: None,
             is_finished: false,
@@ -174,7 +177,10 @@ impl EgoLoop {
             Input::Message(message) => self.take_in(ego, *message, now_nanos),
             Input::Model(cav, descriptor) => {
                 self.waits.described(&cav, &descriptor, now_nanos);
-                self.compare_models(&cav, &descriptor);
+                // After its scene an agent names no stream; what is known of its maps holds for the last of them.
+                if !descriptor.streams.is_empty() {
+                    self.compare_models(&cav, &descriptor);
+                }
             }
             Input::Sweeps(cav, sweeps) => self.compare_clocks(&cav, &sweeps),
             Input::Joined(cav) => {
@@ -217,16 +223,6 @@ impl EgoLoop {
     /// Streams of which a neighbour may publish either or both.
     pub fn neighbour_streams(&self) -> impl Iterator<Item = Stream> + use<> {
         std::iter::once(self.stream).chain(self.reads_boxes.then_some(Stream::Boxes))
-    }
-
-    /// Records that a message was used, or why not, for [`Self::problems`].
-    pub(crate) fn note_use(&mut self, cav: &CavId, reason: Option<DropReason>, now_nanos: u64) {
-        self.waits.note(cav, reason, now_nanos);
-    }
-
-    /// Problems of the ego: missing and untimely messages, and streams, each with the time of its beginning, nanoseconds.
-    pub fn problems(&self, now_nanos: u64) -> Vec<(String, u64)> {
-        self.waits.problems(now_nanos)
     }
 
     /// Summary so far.

@@ -57,14 +57,19 @@ impl Case {
 
     /// The same view, captured `sweeps` later, arrives.
     fn receive(&mut self, view: &View, sweeps: u64) -> Vec<Output> {
+        self.receive_at(view, sweeps * PERIOD, 0)
+    }
+
+    /// The same view, captured `captured_after` later, arrives `arrived_after` later, nanoseconds.
+    fn receive_at(&mut self, view: &View, captured_after: u64, arrived_after: u64) -> Vec<Output> {
         let view = View {
-            capture_nanos: NOW + sweeps * PERIOD,
+            capture_nanos: NOW + captured_after,
             ..view.clone()
         };
         self.handle(Input::Message(Box::new(Message {
             reception: Reception {
                 cav: view.cav.clone(),
-                arrived_nanos: NOW,
+                arrived_nanos: NOW + arrived_after,
                 transport: None,
                 clock_offset_s: None,
             },
@@ -170,4 +175,40 @@ fn boxes_that_come_after_their_map_was_fused_are_not_missing() {
     }
     let left = case.handle(Input::Left(map.cav.clone()));
     assert_eq!(Case::accounts(&left), (vec![], vec![unneeded]));
+}
+
+#[test]
+fn after_a_gap_of_the_recording_a_neighbour_may_be_first() {
+    let mut case = Case::new();
+    let (own, map) = (case.own.clone(), case.map.clone());
+    case.receive(&map, 0);
+    case.receive(&own, 0);
+    case.handle(Input::Wake);
+    let gap = 30 * PERIOD;
+    let early = Case::accounts(&case.receive_at(&map, gap, 0));
+    let future = (Stream::Bev, DropReason::Future);
+    assert_eq!(early, (vec![], vec![future]), "no time has passed");
+    let after_gap = Case::accounts(&case.receive_at(&map, gap, gap));
+    assert_eq!(after_gap, (vec![], vec![]));
+    case.receive(&own, 30);
+    let accounts = Case::accounts(&case.handle(Input::Wake));
+    assert_eq!(accounts, (vec![Stream::Bev], vec![]));
+}
+
+#[test]
+fn after_one_short_step_a_neighbour_that_lags_is_not_awaited_to_the_deadline() {
+    let mut case = Case::new();
+    let (own, map) = (case.own.clone(), case.map.clone());
+    let lag = 2 * PERIOD / 5;
+    // The second step is half as long.
+    for halves in [2, 4, 5, 7, 9] {
+        let captured = halves * PERIOD / 2;
+        case.receive_at(&map, captured - lag, 0);
+        case.receive_at(&own, captured, 0);
+        case.handle(Input::Wake);
+        case.handle(Input::Wake);
+        // While the odd step is one of two, the lead is that of 20 Hz.
+        let waits = case.ego_loop.wakes_nanos().is_some();
+        assert_eq!(waits, halves == 5, "{halves}");
+    }
 }

@@ -15,7 +15,7 @@ const UNTIMELY_NANOS: u64 = 5_000_000_000;
 const MAX_VEHICLES: usize = 64;
 
 /// Messages, streams and vehicles that an ego waits for, each with the time of the beginning, nanoseconds.
-pub(super) struct Waits {
+pub(crate) struct Waits {
     ego: CavId,
     /// Method and the stream that it needs.
     method: String,
@@ -65,8 +65,8 @@ impl Waits {
         }
     }
 
-    /// Records that a neighbour's message was used, or why not.
-    pub(super) fn note(&mut self, cav: &CavId, reason: Option<DropReason>, now_nanos: u64) {
+    /// Records that a neighbour's message was used, or why not, for [`Self::problems`].
+    pub(crate) fn note(&mut self, cav: &CavId, reason: Option<DropReason>, now_nanos: u64) {
         use DropReason::{Clock, Future, Stale};
         let has_room = self.untimely.len() < MAX_VEHICLES;
         let reason = reason.filter(|why| has_room && matches!(why, Clock | Future | Stale));
@@ -79,16 +79,19 @@ impl Waits {
         }
     }
 
-    /// Records a vehicle's descriptor: the streams that it publishes, and that it has sweeps.
+    /// Records a vehicle's descriptor: the streams that it publishes, none after its scene, and that it has sweeps.
     pub(super) fn described(&mut self, cav: &CavId, descriptor: &Descriptor, now_nanos: u64) {
         let streams = &descriptor.streams;
         self.gone.remove(cav);
-        // From the first sweep on: an agent without sweeps has nothing to send yet.
-        if *cav == self.ego && !descriptor.sweeps.is_empty() {
+        let is_own = *cav == self.ego;
+        if is_own && streams.is_empty() {
+            (self.own_nanos, self.own_message_nanos) = (None, None);
+        } else if is_own && !descriptor.sweeps.is_empty() {
+            // From the first sweep on: an agent without sweeps has nothing to send yet.
             self.own_nanos.get_or_insert(now_nanos);
         }
-        let sends_boxes = streams.contains(&Stream::Boxes) && *cav != self.ego;
-        if streams.contains(&self.stream) || (self.reads_boxes && sends_boxes) {
+        let sends_boxes = streams.contains(&Stream::Boxes) && !is_own;
+        if streams.is_empty() || streams.contains(&self.stream) || self.reads_boxes && sends_boxes {
             self.without.remove(cav);
         } else if self.without.len() < MAX_VEHICLES {
             let names: Vec<String> = streams.iter().map(ToString::to_string).collect();
@@ -106,8 +109,9 @@ impl Waits {
         }
     }
 
-    /// Waits of three seconds and more, streams that are missing, and neighbours of which no message is in time.
-    pub(super) fn problems(&self, now_nanos: u64) -> Vec<(String, u64)> {
+    /// Waits of three seconds and more, streams that are missing, and neighbours of which no message is in time, each
+    /// with the time of its beginning, nanoseconds.
+    pub(crate) fn problems(&self, now_nanos: u64) -> Vec<(String, u64)> {
         let Self { ego, stream, .. } = self;
         let late_before = now_nanos.saturating_sub(AFTER_NANOS);
         // An agent that publishes other streams is named for that instead.
@@ -141,12 +145,29 @@ fn is_recent(dropped_nanos: u64, now_nanos: u64) -> bool {
 
 #[cfg(test)]
 mod tests {
-    use protocol::message::ModelHash;
+    use protocol::message::{ModelHash, SweepArrival};
     use protocol::{BevGrid, Dtype};
 
     use super::*;
 
     const SECOND: u64 = 1_000_000_000;
+
+    fn descriptor(streams: Vec<Stream>) -> Descriptor {
+        Descriptor {
+            model_hash: ModelHash([7; 32]),
+            grid: BevGrid {
+                x_min_m: -51.2,
+                y_min_m: -38.4,
+                cell_m: 0.8,
+                width: 128,
+                height: 96,
+            },
+            channels: 64,
+            dtype: Dtype::I8,
+            streams,
+            sweeps: vec![],
+        }
+    }
 
     #[test]
     fn a_neighbour_whose_messages_are_all_untimely_is_named() {
@@ -191,23 +212,29 @@ mod tests {
     }
 
     #[test]
+    fn an_own_agent_whose_scene_has_ended_is_not_awaited() {
+        let own = CavId::new("1").unwrap();
+        let mut waits = Waits::new(&own, "max", Stream::Bev, true);
+        let mut descriptor = descriptor(vec![]);
+        descriptor.sweeps = vec![SweepArrival {
+            before_nanos: 0,
+            arrived_nanos: 5,
+        }];
+        waits.received(&own, SECOND);
+        waits.received(&own, 2 * SECOND);
+        waits.described(&own, &descriptor, 3 * SECOND);
+        assert_eq!(waits.problems(90 * SECOND), []);
+        // The next scene, of which no map comes.
+        descriptor.streams = vec![Stream::Bev];
+        waits.described(&own, &descriptor, 90 * SECOND);
+        assert_eq!(waits.problems(94 * SECOND).len(), 1);
+    }
+
+    #[test]
     fn a_missing_stream_a_silent_agent_and_a_vehicle_that_is_gone_are_named() {
         let [own, other] = ["1", "2"].map(|name| CavId::new(name).unwrap());
         let mut waits = Waits::new(&own, "late", Stream::Boxes, false);
-        let mut descriptor = Descriptor {
-            model_hash: ModelHash([7; 32]),
-            grid: BevGrid {
-                x_min_m: -51.2,
-                y_min_m: -38.4,
-                cell_m: 0.8,
-                width: 128,
-                height: 96,
-            },
-            channels: 64,
-            dtype: Dtype::I8,
-            streams: vec![Stream::Pose, Stream::Bev],
-            sweeps: vec![],
-        };
+        let mut descriptor = descriptor(vec![Stream::Pose, Stream::Bev]);
         waits.described(&other, &descriptor, SECOND);
         let needs = "late needs boxes, agent 2 publishes pose, bev".to_owned();
         assert_eq!(waits.problems(SECOND), [(needs, SECOND)]);

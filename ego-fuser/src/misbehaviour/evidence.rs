@@ -126,11 +126,6 @@ impl Evidence {
             .min_by(|(one, _), (other, _)| one.total_cmp(other))
     }
 
-    /// The log likelihood ratio without the type.
-    pub(super) fn log_odds(&self) -> Option<f64> {
-        self.judgement().map(|(log_odds, _)| log_odds)
-    }
-
     /// Evidence against a neighbour with a wrong position or without perception.
     fn against_elsewhere(&self) -> Option<f64> {
         let seen = [self.ego_sees_it, self.it_sees_ego].into_iter().flatten();
@@ -238,6 +233,13 @@ mod tests {
 
     use super::*;
     use crate::view::Content;
+
+    impl Evidence {
+        /// The log likelihood ratio without the type.
+        fn log_odds(&self) -> Option<f64> {
+            self.judgement().map(|(log_odds, _)| log_odds)
+        }
+    }
 
     /// Boxes that a vehicle at a position detects of the vehicles in a world.
     fn boxes(world: &[[f64; 2]], from: [f64; 2]) -> Content {

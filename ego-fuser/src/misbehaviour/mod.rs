@@ -130,8 +130,9 @@ impl MisbehaviourDetector {
         }
         // Of two neighbours with the same message, the one with the weaker evidence otherwise is the copier; both where
         // neither has any in its favour.
-        let log_odds = evidence.iter().map(|one| one.as_ref()?.log_odds());
-        let fits: Vec<f64> = log_odds.map(|odds| odds.unwrap_or(0.0)).collect();
+        let log_odds = evidence.iter().map(|one| one.as_ref()?.judgement());
+        let log_odds = log_odds.map(|found| found.map_or(0.0, |(odds, _)| odds));
+        let fits: Vec<f64> = log_odds.collect();
         for (index, evidence) in evidence.iter_mut().enumerate() {
             let Some(evidence) = evidence else { continue };
             let message = &all[index].fingerprint;

@@ -17,7 +17,7 @@ use protocol::{Box3d, Pose};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use tch::Device;
-use training::loss::{LabelTensors, LossConfig, Unassigned, detection_loss};
+use training::loss::{LabelTensors, Unassigned, detection_loss};
 
 /// Views of one sample.
 const AGENTS: usize = 3;
@@ -80,26 +80,21 @@ fn training_step(criterion: &mut Criterion) {
             .expect("lean is a valid configuration");
         model.set_precision(precision);
         let mut optimizer = AdamW::new(&model.variables, AdamWConfig::default());
-        let assigner = model.assigner().expect("lean has anchors");
+        let assigner = model.assigner();
         let labels: Vec<_> = (0..SAMPLES)
             .map(|_| assigner.assign(&objects(&mut rng)))
             .collect();
         let labels = LabelTensors::gather(&labels, Unassigned::Ignored, Device::Cpu);
         let batch = PillarBatch::new(
             &pillars.iter().collect::<Vec<_>>(),
-            &model.network().pillar_grid,
+            &model.network.pillar_grid,
         );
         group.bench_function(name, |bencher| {
             bencher.iter(|| {
                 let output = model
                     .forward(&batch, &facts, true)
                     .expect("views and facts add up");
-                let loss = detection_loss(
-                    &output.head.scores,
-                    &output.head.offsets,
-                    &labels,
-                    &LossConfig::default(),
-                );
+                let loss = detection_loss(&output.head.scores, &output.head.offsets, &labels);
                 optimizer.zero_grad();
                 loss.expect("labels fit").total().backward();
                 black_box(optimizer.step(1e-3).expect("gradients are finite"));

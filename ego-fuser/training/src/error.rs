@@ -4,7 +4,6 @@ use dataset::ReadError;
 use figures::FigureError;
 use fusion::method::Method;
 use fusion::model::ModelError;
-use fusion::targets::AnchorGridError;
 use localization::pose_source::PoseSourceError;
 use perception::detector::DetectorError;
 use perception::torch_error::first_line;
@@ -30,9 +29,6 @@ pub enum Error {
     /// The settings of the pose error are invalid.
     #[error(transparent)]
     Poses(#[from] PoseSourceError),
-    /// The anchors of the configuration are not on a grid.
-    #[error(transparent)]
-    AnchorGrid(#[from] AnchorGridError),
     /// The frozen encoder cannot be built or run.
     #[error(transparent)]
     Detector(#[from] DetectorError),

@@ -3,7 +3,7 @@
 //! Methods with a common encoder differ in the fusion of its maps; the encoder, which takes most of the time, need not
 //! run again for each of them, nor for each pass over the data. The file belongs to one encoder with its settings, one
 //! set of data (its contents), one program and one wire version: all are in its name. It holds one packed message per sweep, as on the wire, each
-//! after its length: truncated or changed messages are detected.
+//! after its length: truncated, changed and exchanged messages are detected, and computed again where they are needed.
 
 mod sweep_encoder;
 
@@ -12,17 +12,18 @@ use std::fs::{self, File, OpenOptions};
 use std::io::{self, Write};
 use std::os::unix::fs::FileExt;
 use std::path::PathBuf;
-use std::sync::Arc;
+use std::sync::{Arc, Once};
 
 use dataset::{self, IntensityScale, LoadOptions, Scenario};
 use perception::train::Prefetch;
 use perception::weights::Weights;
 use protocol::message::Bev;
 use protocol::text::hex;
-use protocol::{Dtype, Limits, WIRE_VERSION, WireError, wire};
+use protocol::{Dtype, Limits, WIRE_VERSION, wire};
 use sha2::{Digest, Sha256};
 use support::file_digests::FileDigests;
-use support::file_error::AtFile;
+use support::file_error::{AtFile, FileError};
+use support::output;
 use tch::Tensor;
 
 use sweep_encoder::{SweepEncoder, ThreadEncoder};
@@ -55,14 +56,13 @@ pub fn is_encoder(name: &str) -> bool {
 pub struct FeatureStore {
     path: PathBuf,
     file: File,
-    /// Names of the scenarios.
-    names: Vec<String>,
+    scenarios: Arc<[Scenario]>,
     /// Index of each scenario's first sweep, and of the end.
     first: Vec<usize>,
-    /// Ticks of each scenario.
-    ticks: Vec<usize>,
     /// Offset of each message in the file, and the end of the last one, bytes.
     starts: Vec<u64>,
+    /// The note of the first record that was changed.
+    noted: Once,
 }
 
 impl FeatureStore {
@@ -126,9 +126,10 @@ impl FeatureStore {
         let starts = starts(&file, first[first.len() - 1]).at(&path)?;
         // A truncated message is encoded again.
         file.set_len(starts[starts.len() - 1]).at(&path)?;
+        let scenarios: Arc<[Scenario]> = scenarios.into();
         let encoder = SweepEncoder {
             encoder: ThreadEncoder::new(Arc::clone(weights)),
-            scenarios: scenarios.into(),
+            scenarios: Arc::clone(&scenarios),
             first: first.as_slice().into(),
             dtype: kept.dtype,
             path: path.clone(),
@@ -136,10 +137,10 @@ impl FeatureStore {
         let mut store = Self {
             path,
             file,
-            names: scenarios.iter().map(|of| of.name.clone()).collect(),
+            scenarios,
             first,
-            ticks: scenarios.iter().map(|of| of.ticks.len()).collect(),
             starts,
+            noted: Once::new(),
         };
         store.fill(encoder, kept.limit_bytes, threads, on_sweep)?;
         store.file.unlock().at(&store.path)?;
@@ -175,13 +176,13 @@ impl FeatureStore {
         Ok(())
     }
 
-    /// The map of a sweep, `[1, C, H, W]`, by scenario, agent and tick; `None` where it did not fit or the sweep could
-    /// not be read.
+    /// The map of a sweep, `[1, C, H, W]`, by scenario, agent and tick; `None` where it did not fit, the sweep could not
+    /// be read, or its record was changed, of which the first is noted.
     ///
     /// # Errors
-    /// [`Error`] when the file cannot be read or was changed.
+    /// [`Error`] when the file cannot be read.
     pub fn map(&self, scenario: usize, agent: usize, tick: usize) -> Result<Option<Tensor>, Error> {
-        let place = self.first[scenario] + agent * self.ticks[scenario] + tick;
+        let place = self.first[scenario] + agent * self.scenarios[scenario].ticks.len() + tick;
         let Some(&[start, end]) = self.starts.get(place..place + 2) else {
             return Ok(None);
         };
@@ -189,8 +190,15 @@ impl FeatureStore {
         if start + LENGTH_BYTES == end {
             return Ok(None);
         }
-        let message = message_between(&self.file, start, end).at(&self.path)?;
-        let message = message.at(&self.path)?;
+        let message = message_of(place, &self.file, start, end).at(&self.path)?;
+        let message = message.inspect_err(|problem| {
+            let what = format!("map of sweep {place}: {problem}; it is computed again");
+            let note = FileError::new(&self.path, what);
+            self.noted.call_once(|| output::note(note));
+        });
+        let Ok(message) = message else {
+            return Ok(None);
+        };
         let decoded = message.features.decode(&Limits::DEFAULT);
         let features = decoded.at(&self.path)?.features;
         let (channels, grid) = (features.channels, features.grid);
@@ -227,20 +235,24 @@ fn starts(file: &File, all: usize) -> io::Result<Vec<u64>> {
     }
     // A power cut may leave zeros from some place on: in the last message that is not empty, then as empty messages.
     while let &[.., start, end] = starts.as_slice()
-        && message_between(file, start, end)?.is_err()
+        && message_of(starts.len() - 2, file, start, end)?.is_err()
     {
         starts.pop();
     }
     Ok(starts)
 }
 
-/// The message in the record between two offsets; an inner error where the record holds none that can be read.
-fn message_between(file: &File, start: u64, end: u64) -> io::Result<Result<Bev, WireError>> {
+/// The message of a sweep in the record between two offsets; an inner error where the record holds none that can be read,
+/// or that of another sweep.
+fn message_of(sweep: usize, file: &File, start: u64, end: u64) -> io::Result<Result<Bev, String>> {
     let mut bytes = vec![0; (end - start - LENGTH_BYTES) as usize];
     // At an offset of its own: threads share the file without moving a common position.
     file.read_exact_at(&mut bytes, start + LENGTH_BYTES)?;
-    let decoded = wire::decode([bytes.as_slice()], &Limits::DEFAULT);
-    Ok(decoded.map(|(_, message)| message))
+    Ok(match wire::decode([bytes.as_slice()], &Limits::DEFAULT) {
+        Ok((header, message)) if header.stamp.sequence == sweep as u64 => Ok(message),
+        Ok((header, _)) => Err(format!("its record is of sweep {}", header.stamp.sequence)),
+        Err(error) => Err(error.to_string()),
+    })
 }
 
 /// Maps from a store, and from the encoder for sweeps that it does not hold.
@@ -259,8 +271,8 @@ impl MapSource {
 
     /// The index of a scenario.
     pub fn index_of(&self, scenario: &str) -> Option<usize> {
-        let mut names = self.store.names.iter();
-        names.position(|name| name == scenario)
+        let mut scenarios = self.store.scenarios.iter();
+        scenarios.position(|of| of.name == scenario)
     }
 
     /// The map of a sweep, `[1, C, H, W]`; `scenario` is the one of that index.

@@ -15,19 +15,20 @@ const METRES_PER_RADIAN: f64 = 20.0;
 /// Remaining pose errors beyond this are out of the range of FSA and not trained, metres.
 const RECOVERABLE_M: f64 = 5.0;
 
-/// Weights and shapes of the two terms.
-#[derive(Debug, Clone, Copy, PartialEq)]
+/// Focal loss: share of the positives.
+pub const ALPHA: f64 = 0.25;
+/// Focal loss: exponent that reduces the weight of easy anchors.
+pub const GAMMA: f64 = 2.0;
+/// Smooth L1: end of the quadratic part.
+pub const BETA: f64 = 1.0 / 9.0;
+/// Weight of the classification term.
+pub const SCORE_WEIGHT: f64 = 1.0;
+/// Weight of the regression term.
+pub const BOX_WEIGHT: f64 = 2.0;
+
+/// What of the loss is set for a training.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct LossConfig {
-    /// Focal loss: share of the positives.
-    pub alpha: f64,
-    /// Focal loss: exponent that reduces the weight of easy anchors.
-    pub gamma: f64,
-    /// Smooth L1: end of the quadratic part.
-    pub beta: f64,
-    /// Weight of the classification term.
-    pub score_weight: f64,
-    /// Weight of the regression term.
-    pub box_weight: f64,
     /// Weight of the alignment term: the difference of a fusion's own pose corrections from the errors that were added.
     /// 0: only the detection loss trains the alignment, as in the paper.
     pub alignment_weight: f64,
@@ -35,24 +36,11 @@ pub struct LossConfig {
     pub unassigned: Unassigned,
 }
 
-impl Default for LossConfig {
-    fn default() -> Self {
-        Self {
-            alpha: 0.25,
-            gamma: 2.0,
-            beta: 1.0 / 9.0,
-            score_weight: 1.0,
-            box_weight: 2.0,
-            alignment_weight: 0.0,
-            unassigned: Unassigned::Background,
-        }
-    }
-}
-
 /// Treatment of anchors between the two overlap thresholds.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Unassigned {
     /// They count as background: the behaviour of OpenCOOD.
+    #[default]
     Background,
     /// They are ignored: the intention of its label generator.
     Ignored,
@@ -136,18 +124,13 @@ impl LabelTensors {
 ///
 /// # Errors
 /// [`tch::TchError`] when the maps do not fit the labels.
-pub fn detection_loss(
-    scores: &Tensor,
-    boxes: &Tensor,
-    labels: &LabelTensors,
-    config: &LossConfig,
-) -> Result<Loss> {
+pub fn detection_loss(scores: &Tensor, boxes: &Tensor, labels: &LabelTensors) -> Result<Loss> {
     let batch = scores.size()[0].max(1) as f64;
-    let score = focal_loss(scores, labels, config)?.f_sum(Kind::Float)?;
-    let boxes = box_loss(boxes, labels, config)?.f_sum(Kind::Float)?;
+    let score = focal_loss(scores, labels)?.f_sum(Kind::Float)?;
+    let boxes = box_loss(boxes, labels)?.f_sum(Kind::Float)?;
     Ok(Loss {
-        score: score * (config.score_weight / batch),
-        boxes: boxes * (config.box_weight / batch),
+        score: score * (SCORE_WEIGHT / batch),
+        boxes: boxes * (BOX_WEIGHT / batch),
     })
 }
 
@@ -184,7 +167,7 @@ pub(crate) fn alignment_loss(
 }
 
 /// Weighted focal loss of every anchor, `[B, H*W*A]`.
-fn focal_loss(scores: &Tensor, labels: &LabelTensors, config: &LossConfig) -> Result<Tensor> {
+fn focal_loss(scores: &Tensor, labels: &LabelTensors) -> Result<Tensor> {
     let target = &labels.positive;
     // Labels have the anchors of a cell next to each other: `[B, H, W, A]`.
     let logits = scores.f_to_kind(Kind::Float)?.f_permute([0, 2, 3, 1])?;
@@ -193,14 +176,14 @@ fn focal_loss(scores: &Tensor, labels: &LabelTensors, config: &LossConfig) -> Re
     let background: Tensor = 1.0 - target;
     // 1 - p_t of the paper: error of the prediction.
     let wrong: Tensor = target * (1.0 - &probability) + &background * &probability;
-    let balance = target * config.alpha + &background * (1.0 - config.alpha);
+    let balance = target * ALPHA + &background * (1.0 - ALPHA);
     let (none, each) = (None::<&Tensor>, tch::Reduction::None);
     let entropy = logits.f_binary_cross_entropy_with_logits(target, none, none, each)?;
-    Ok(balance * wrong.f_pow_tensor_scalar(config.gamma)? * entropy * &labels.score_weight)
+    Ok(balance * wrong.f_pow_tensor_scalar(GAMMA)? * entropy * &labels.score_weight)
 }
 
 /// Weighted smooth L1 of every positive, `[P, 7]`.
-fn box_loss(boxes: &Tensor, labels: &LabelTensors, config: &LossConfig) -> Result<Tensor> {
+fn box_loss(boxes: &Tensor, labels: &LabelTensors) -> Result<Tensor> {
     let code = BOX_CODE as i64;
     let predicted = boxes.f_permute([0, 2, 3, 1])?.f_reshape([-1, code])?;
     let predicted = predicted.f_index_select(0, &labels.index)?;
@@ -209,9 +192,9 @@ fn box_loss(boxes: &Tensor, labels: &LabelTensors, config: &LossConfig) -> Resul
     // The sine is 0 for a heading and its opposite: a box turned by half a circle is the same box.
     let turn = difference.f_narrow(1, code - 1, 1)?.f_sin()?;
     let distance = Tensor::f_cat(&[linear, turn], 1)?.f_abs()?;
-    let squared = distance.f_square()? * (0.5 / config.beta);
-    let above = &distance - 0.5 * config.beta;
-    let loss = squared.f_where_self(&distance.f_lt(config.beta)?, &above)?;
+    let squared = distance.f_square()? * (0.5 / BETA);
+    let above = &distance - 0.5 * BETA;
+    let loss = squared.f_where_self(&distance.f_lt(BETA)?, &above)?;
     Ok(loss * labels.box_weight.f_unsqueeze(1)?)
 }
 
@@ -234,12 +217,8 @@ mod tests {
         labels: &[Labels],
         unassigned: Unassigned,
     ) -> (f64, f64) {
-        let config = LossConfig {
-            unassigned,
-            ..LossConfig::default()
-        };
         let tensors = LabelTensors::gather(labels, unassigned, Device::Cpu);
-        let loss = detection_loss(scores, boxes, &tensors, &config).unwrap();
+        let loss = detection_loss(scores, boxes, &tensors).unwrap();
         (loss.score.double_value(&[]), loss.boxes.double_value(&[]))
     }
 

@@ -216,7 +216,9 @@ impl Bus {
     /// waits there or has returned since the last status. A stalled process thus stops its heartbeats, which a
     /// supervisor detects.
     pub fn works_from(&self, inbox: &Inbox) -> Heartbeat {
-        Heartbeat::begin(&self.status, &inbox.watchdog)
+        let (status, watchdog) = (self.status.clone(), Arc::clone(&inbox.watchdog));
+        status.watch(Some(Arc::clone(&watchdog)));
+        Heartbeat { status, watchdog }
     }
 
     /// Delivers `topic` into `inbox`.

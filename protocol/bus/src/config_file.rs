@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
+use protocol::text::excerpt;
 use serde::de::{DeserializeOwned, IgnoredAny};
 use support::bounded_file;
 use support::file_error::{AtFile, FileError};
@@ -11,6 +12,8 @@ use super::unknown_field;
 
 /// Maximum size of a file, bytes.
 const MAX_BYTES: u64 = 1 << 20;
+/// Characters of a line that an error states at most: a value with its field on a screen.
+const MAX_LINE_CHARS: usize = 80;
 
 /// Reads a YAML file of at most 1 MiB.
 ///
@@ -46,9 +49,11 @@ pub fn parse<T: DeserializeOwned>(text: &str, path: &Path) -> Result<T, FileErro
                 .map_or_else(|_| Vec::new(), |fields| fields.into_keys().collect()),
         };
         let reason = unknown_field::explained(reason(&error), &fields);
+        let line = error.location().map(|location| location.line());
+        let reason = with_value(reason, line, text);
         let problem = field.map_or(reason.clone(), |field| format!("{field}: {reason}"));
         FileError {
-            line: error.location().map(|location| location.line()),
+            line,
             ..FileError::new(path, problem)
         }
     })
@@ -61,6 +66,16 @@ fn reason(error: &serde_saphyr::Error) -> String {
     line.rsplit_once(" at line ")
         .map_or(line, |(reason, _)| reason)
         .to_owned()
+}
+
+/// The reason, and where it states a kind of value alone ("invalid u64"), the text of the line with the value found.
+fn with_value(reason: String, line: Option<u64>, text: &str) -> String {
+    let mut lines = text.lines().zip(1..);
+    let found = lines.find(|(_, number)| line == Some(*number));
+    match found.filter(|_| reason.starts_with("invalid ") && !reason.contains(':')) {
+        Some((found, _)) => format!("{reason} in {:?}", excerpt(found.trim(), MAX_LINE_CHARS)),
+        None => reason,
+    }
 }
 
 #[cfg(test)]
@@ -99,6 +114,16 @@ mod tests {
             "{message}"
         );
         assert_eq!(error_of("{}"), "a.yaml:1: missing field `scene`");
+    }
+
+    #[test]
+    fn a_wrong_value_is_stated_as_its_line_is() {
+        let reason = "scene.rate: invalid floating point in";
+        let message = error_of("scene:\n  rate: 0x10\n");
+        assert_eq!(message, format!("a.yaml:2: {reason} \"rate: 0x10\""));
+        let long = "x".repeat(1000);
+        let message = error_of(&format!("scene: {{rate: {long}}}\n"));
+        assert!(message.contains(reason) && message.len() < 200, "{message}");
     }
 
     #[test]

@@ -8,19 +8,11 @@ use super::watchdog::Watchdog;
 /// Ties the status of a process to the activity of a thread, see [`super::Bus::works_from`]; until this is dropped.
 #[must_use = "the watchdog is released when this is dropped"]
 pub struct Heartbeat {
-    status: StatusPublisher,
-    watchdog: Arc<Watchdog>,
+    pub(super) status: StatusPublisher,
+    pub(super) watchdog: Arc<Watchdog>,
 }
 
 impl Heartbeat {
-    pub(super) fn begin(status: &StatusPublisher, watchdog: &Arc<Watchdog>) -> Self {
-        status.watch(Some(Arc::clone(watchdog)));
-        Self {
-            status: status.clone(),
-            watchdog: Arc::clone(watchdog),
-        }
-    }
-
     /// Records activity of the thread without taking from the inbox.
     pub fn beat(&self) {
         self.watchdog.beat();

@@ -82,7 +82,7 @@ pub use error::{BusError, Result};
 pub use frame_stats::FrameStats;
 pub use heartbeat::Heartbeat;
 pub use inbox_limits::InboxLimits;
-pub use liveliness::{LivelinessEvent, LivelinessToken, present, tokens};
+pub use liveliness::{LivelinessToken, present, tokens};
 pub use membership::Membership;
 pub use message_stats::{MessageStats, SharedMemoryUse};
 pub use metrics::MetricsPeer;

@@ -61,25 +61,6 @@ fn holder(token: &str) -> Option<(Role, CavId)> {
     Some((role, cav))
 }
 
-/// A process joined or left.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub enum LivelinessEvent {
-    /// The process is alive, possibly since long before the subscription.
-    Joined {
-        /// Role of the process.
-        role: Role,
-        /// Vehicle of the process.
-        cav: CavId,
-    },
-    /// The process is gone.
-    Left {
-        /// Role of the process.
-        role: Role,
-        /// Vehicle of the process.
-        cav: CavId,
-    },
-}
-
 impl Bus {
     /// Declares the liveliness token of this process in its role.
     ///
@@ -94,7 +75,8 @@ impl Bus {
             .map_err(|cause| BusError::zenoh(format!("announcing {key}"), &cause))
     }
 
-    /// Subscribes to the liveliness of the processes of a role, present ones first.
+    /// Subscribes to the liveliness of the processes of a role, present ones first: the vehicle of each that joins
+    /// (`true`), possibly long before, or leaves.
     ///
     /// `report` runs on zenoh's receive thread: it hands over and returns, and must not call zenoh.
     ///
@@ -103,7 +85,7 @@ impl Bus {
     pub fn watch(
         &self,
         role: Role,
-        report: impl Fn(LivelinessEvent) + Send + Sync + 'static,
+        report: impl Fn(CavId, bool) + Send + Sync + 'static,
     ) -> Result<Subscription> {
         let tokens = KeyExpr::alive(&self.identity().run, role);
         let liveliness = self.session().liveliness();
@@ -111,11 +93,8 @@ impl Bus {
             .declare_subscriber(tokens.as_str())
             .history(true)
             .callback(move |sample| {
-                if let Some((role, cav)) = holder(sample.key_expr().as_str()) {
-                    report(match sample.kind() {
-                        SampleKind::Put => LivelinessEvent::Joined { role, cav },
-                        SampleKind::Delete => LivelinessEvent::Left { role, cav },
-                    });
+                if let Some((_, cav)) = holder(sample.key_expr().as_str()) {
+                    report(cav, sample.kind() == SampleKind::Put);
                 }
             });
         subscriber

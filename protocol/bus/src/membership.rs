@@ -6,7 +6,6 @@ use std::time::Instant;
 use protocol::{CavId, Role};
 
 use super::bounded_queue::{BoundedQueue, Pop, PushOutcome};
-use super::liveliness::LivelinessEvent;
 use super::{Bus, BusError, Subscription};
 
 /// Liveliness events that wait to be polled; only the last of each vehicle is kept.
@@ -25,11 +24,7 @@ impl Membership {
         let events = Arc::new(BoundedQueue::new(1, most));
         let subscription = bus.watch(role, {
             let events = Arc::clone(&events);
-            move |event| {
-                let (cav, is_there) = match event {
-                    LivelinessEvent::Joined { cav, .. } => (cav, true),
-                    LivelinessEvent::Left { cav, .. } => (cav, false),
-                };
+            move |cav: CavId, is_there| {
                 if let PushOutcome::NoLane(_) = events.push(cav.clone(), is_there) {
                     tracing::warn!(%cav, "more processes join and leave than can be tracked");
                 }

@@ -79,19 +79,11 @@ const BUCKETS_S: [f64; 14] = [
     0.0001, 0.00025, 0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5,
 ];
 
-/// Durations of a stage, over all frames so far.
-#[derive(Debug, Clone, PartialEq)]
-pub(crate) struct StageHistogram {
-    /// Name of the stage.
-    pub stage: String,
-    /// Number of frames.
-    pub count: u64,
-    /// Sum of the durations, seconds.
-    pub sum_s: f64,
-    /// Upper bound in seconds and number of frames of every bucket; the last is unbounded ([`f64::MAX`]).
-    pub buckets: Vec<(f64, u64)>,
-}
+/// Histogram of a stage over all its frames: its name, the number of frames, the sum of the durations in seconds, and of
+/// every bucket the upper bound in seconds and the number of frames; the last is unbounded ([`f64::MAX`]).
+pub(crate) type StageHistogram = (String, u64, f64, Vec<(f64, u64)>);
 
+/// Durations of a stage, over all frames so far.
 #[derive(Debug, Default)]
 struct Timings {
     count: u64,
@@ -400,11 +392,10 @@ impl MessageStats {
     pub(crate) fn histograms(&self) -> Vec<StageHistogram> {
         let state = self.lock();
         let ends = BUCKETS_S.into_iter().chain([f64::MAX]);
-        let histograms = state.stages.iter().map(|(stage, timings)| StageHistogram {
-            stage: stage.clone(),
-            count: timings.count,
-            sum_s: timings.sum.as_secs_f64(),
-            buckets: ends.clone().zip(timings.buckets).collect(),
+        let histograms = state.stages.iter().map(|(stage, timings)| {
+            let buckets: Vec<_> = ends.clone().zip(timings.buckets).collect();
+            let sum_s = timings.sum.as_secs_f64();
+            (stage.clone(), timings.count, sum_s, buckets)
         });
         histograms.collect()
     }

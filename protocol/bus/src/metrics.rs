@@ -211,10 +211,10 @@ impl Collector for StatsCollector {
         let help = "Duration of a stage for one frame";
         let mut stages =
             encoder.encode_descriptor("stage", help, seconds, MetricType::Histogram)?;
-        for stage in self.0.histograms() {
-            let labels = [("stage", stage.stage.as_str())];
+        for (stage, count, sum_s, buckets) in self.0.histograms() {
+            let labels = [("stage", stage.as_str())];
             let mut family = stages.encode_family(&labels)?;
-            family.encode_histogram::<NoLabels>(stage.sum_s, stage.count, &stage.buckets, None)?;
+            family.encode_histogram::<NoLabels>(sum_s, count, &buckets, None)?;
         }
         Ok(())
     }

@@ -46,17 +46,13 @@ struct TopicSenders {
 #[derive(Debug)]
 struct Sender {
     epoch: u64,
-    numbers: SequenceWindow,
+    /// Highest sequence number received.
+    highest: u64,
+    /// Sequence numbers received: a bit mask of the highest and the 63 before it.
+    came: u64,
     last_seen: Instant,
     /// Time at which another epoch replaced this one.
     replaced: Instant,
-}
-
-/// Sequence numbers received: the highest, and a bit mask of it and the 63 before it.
-#[derive(Debug)]
-struct SequenceWindow {
-    highest: u64,
-    came: u64,
 }
 
 impl ReplayWindow {
@@ -107,7 +103,7 @@ impl TopicSenders {
 
     fn judge(&mut self, epoch: u64, sequence: u64, now: Instant) -> Option<DropReason> {
         if epoch == self.current.epoch {
-            let repeated = self.current.numbers.note(sequence);
+            let repeated = self.current.note(sequence);
             if repeated.is_none() {
                 self.current.last_seen = now;
             }
@@ -140,7 +136,7 @@ impl TopicSenders {
     ) -> Option<DropReason> {
         let sender = self.former.get_mut(place)?;
         // A replayed message must neither renew the sender nor begin a quarantine.
-        if let Some(repeated) = sender.numbers.note(sequence) {
+        if let Some(repeated) = sender.note(sequence) {
             return Some(repeated);
         }
         sender.last_seen = now;
@@ -173,17 +169,13 @@ impl Sender {
     fn new(epoch: u64, sequence: u64, now: Instant) -> Self {
         Self {
             epoch,
-            numbers: SequenceWindow {
-                highest: sequence,
-                came: 1,
-            },
+            highest: sequence,
+            came: 1,
             last_seen: now,
             replaced: now,
         }
     }
-}
 
-impl SequenceWindow {
     /// Adds a sequence number; returns the drop reason if it is rejected. Overtaken messages are stale.
     fn note(&mut self, sequence: u64) -> Option<DropReason> {
         if sequence > self.highest {

@@ -49,21 +49,13 @@ pub(crate) struct Listener {
     is_over: bool,
 }
 
-/// Result of one step of a listener.
-enum ListenerStep {
-    Message(RawMessage),
-    /// Nothing within the poll interval.
-    Waiting,
-    /// No message will follow.
-    End,
-}
-
 impl Listener {
-    /// The next message, waiting for one so long: without Python's lock, and such that Ctrl-C interrupts.
-    fn step(&mut self, py: Python<'_>, wait: Duration) -> PyResult<ListenerStep> {
+    /// The next message, waiting for one so long: without Python's lock, and such that Ctrl-C interrupts. Closed if no
+    /// message will follow.
+    fn step(&mut self, py: Python<'_>, wait: Duration) -> PyResult<Pop<Topic, RawMessage>> {
         py.check_signals()?;
         let Some((bus, subscriber)) = &self.connection else {
-            return Ok(ListenerStep::End);
+            return Ok(Pop::Closed);
         };
         let has_ended = self.is_over && self.last_data.elapsed() >= self.frames.settle;
         // After the end only what is queued is still handed out.
@@ -81,16 +73,16 @@ impl Listener {
                 if !matches!(topic, Topic::Stats(_)) {
                     self.last_data = Instant::now();
                 }
-                Ok(ListenerStep::Message(message))
+                Ok(Pop::Item(topic, message))
             }
-            Pop::Closed => Ok(ListenerStep::End),
-            Pop::TimedOut if has_ended => Ok(ListenerStep::End),
+            Pop::Closed => Ok(Pop::Closed),
+            Pop::TimedOut if has_ended => Ok(Pop::Closed),
             Pop::TimedOut => self.silence(),
         }
     }
 
     /// Nothing has arrived: the end, or a run that is not there.
-    fn silence(&self) -> PyResult<ListenerStep> {
+    fn silence(&self) -> PyResult<Pop<Topic, RawMessage>> {
         let silent = self.last_message.elapsed();
         match self.timeout {
             Some(timeout) if silent >= timeout && self.messages == 0 => Err(error(format!(
@@ -99,8 +91,8 @@ impl Listener {
                 self.endpoint,
                 timeout.as_secs_f64()
             ))),
-            Some(timeout) if silent >= timeout => Ok(ListenerStep::End),
-            _ => Ok(ListenerStep::Waiting),
+            Some(timeout) if silent >= timeout => Ok(Pop::Closed),
+            _ => Ok(Pop::TimedOut),
         }
     }
 
@@ -143,15 +135,15 @@ impl Listener {
             // A loop that is slow finds messages in the queue that belong to frames which look complete.
             let is_settled = self.frames.is_settled();
             match self.step(py, if is_settled { Duration::ZERO } else { POLL })? {
-                ListenerStep::Message(message) if is_part_of_frames(&message.key.topic) => {
+                Pop::Item(topic, message) if is_part_of_frames(&topic) => {
                     let frames = &mut self.frames;
                     if let Err(cause) = py.detach(|| frames.add(&message)) {
                         self.reject(&message.key, &cause);
                     }
                 }
-                ListenerStep::Waiting if is_settled => self.frames.hand_over_oldest(),
-                ListenerStep::Message(_) | ListenerStep::Waiting => {}
-                ListenerStep::End => {
+                Pop::TimedOut if is_settled => self.frames.hand_over_oldest(),
+                Pop::Item(..) | Pop::TimedOut => {}
+                Pop::Closed => {
                     self.frames.finish();
                     let last = self.frames.ready.pop_front();
                     return last.map(|parts| FleetFrame::new(py, parts)).transpose();
@@ -225,9 +217,9 @@ impl MessageIterator {
         let mut listener: PyRefMut<'_, Listener> = self.listener.try_borrow_mut(py)?;
         loop {
             let message = match listener.step(py, POLL)? {
-                ListenerStep::Message(message) if !message.key.topic.is_json() => message,
-                ListenerStep::Message(_) | ListenerStep::Waiting => continue,
-                ListenerStep::End => return Ok(None),
+                Pop::Item(topic, message) if !topic.is_json() => message,
+                Pop::Item(..) | Pop::TimedOut => continue,
+                Pop::Closed => return Ok(None),
             };
             match py.detach(|| DecodedMessage::of_key(&message.key, &message.bytes())) {
                 Ok(decoded) => {

@@ -48,7 +48,7 @@ mod type_hash;
 pub use encode::{
     FrameInParent, Mount, MountError, body_in_lidar, clock, pose, static_transforms, transforms,
 };
-pub use motion::{MotionType, TimedMotion};
+pub use motion::MotionType;
 pub use names::{FrameNames, NameError, RosName};
 pub use point_cloud::{RosSweep, read_point_cloud};
 pub use qos::Qos;

@@ -166,7 +166,7 @@ fn coordinate(fields: &[RosField<'_>], name: &'static str) -> Result<PointColumn
     found.map(|(_, column)| column).ok_or_else(|| {
         let names = fields.iter().map(|field| excerpt(field.name, 40));
         let found: Vec<String> = names.collect();
-        ReadError::Field(format!("no field {name:?} among {found:?}"))
+        ReadError(format!("no field {name:?} among {found:?}"))
     })
 }
 
@@ -216,7 +216,7 @@ fn column<'a>(
             let offset = field.offset;
             Ok(Some((field.name, PointColumn { offset, datatype })))
         }
-        _ => Err(ReadError::Field(format!(
+        _ => Err(ReadError(format!(
             "field {name:?} has datatype {} and count {}, not {allowed}",
             field.datatype, field.count
         ))),
@@ -234,12 +234,10 @@ struct CloudLayout {
 impl CloudLayout {
     /// Bytes from one row to the next.
     fn stride(&self) -> u64 {
-        let row = u64::from(self.width) * u64::from(self.point_step);
         // The only row of a cloud needs no step, and some drivers give none.
-        if self.height > 1 {
-            u64::from(self.row_step)
-        } else {
-            row
+        match self.height {
+            2.. => self.row_step.into(),
+            _ => u64::from(self.width) * u64::from(self.point_step),
         }
     }
 
@@ -269,7 +267,7 @@ fn at_least(what: &str, found: u64, needed: u64, why: &str) -> Result<(), ReadEr
         return Ok(());
     }
     let problem = format!("{what} is {found}, not at least {needed} ({why})");
-    Err(ReadError::Field(problem))
+    Err(ReadError(problem))
 }
 
 fn at_most(what: &str, found: u64, max: u64) -> Result<(), ReadError> {
@@ -277,7 +275,7 @@ fn at_most(what: &str, found: u64, max: u64) -> Result<(), ReadError> {
         return Ok(());
     }
     let problem = format!("{what}: {found}, at most {max} are accepted");
-    Err(ReadError::Field(problem))
+    Err(ReadError(problem))
 }
 
 fn read_fields<'a>(message: &mut Reader<'a>) -> Result<Vec<RosField<'a>>, ReadError> {

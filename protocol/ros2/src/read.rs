@@ -5,18 +5,8 @@ use re_cdr::{BigEndian, CdrReader, LittleEndian};
 
 /// Error of a message that cannot be read.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub enum ReadError {
-    /// The encapsulation header, the first bytes of the message, names another encoding.
-    #[error("encoding {0:?}, not 00 00 or 00 01 (CDR)")]
-    Encoding(Vec<u8>),
-    /// The message ends early, or a text or flag in it is malformed: the text names the field, its position in bytes after
-    /// the encapsulation header and the length of the message. Or a value is not one that the message may have (a capture
-    /// time before 1970 or with more than 10^9 nanoseconds, a layout of points that contradicts itself or holds too much, a
-    /// value that no vehicle reaches or that the sensor does not measure, a pose in another frame or none, a variance that
-    /// is none): the text names the field, its value and what is allowed.
-    #[error("{0}")]
-    Field(String),
-}
+#[error("{0}")]
+pub struct ReadError(pub(crate) String);
 
 /// Reader of one message after its encapsulation header, in the byte order that the header states.
 pub(crate) struct Reader<'a> {
@@ -37,8 +27,9 @@ impl<'a> Reader<'a> {
             Some(([0, 0, _, _], body)) => (AnyCdr::BigEndian(CdrReader::new(body)), body.len()),
             Some(([0, 1, _, _], body)) => (AnyCdr::LittleEndian(CdrReader::new(body)), body.len()),
             _ => {
-                let found = bytes.iter().take(4).copied().collect();
-                return Err(ReadError::Encoding(found));
+                let found: Vec<u8> = bytes.iter().take(4).copied().collect();
+                let problem = format!("encoding {found:?}, not 00 00 or 00 01 (CDR)");
+                return Err(ReadError(problem));
             }
         };
         Ok(Self { cdr, len })
@@ -57,7 +48,7 @@ impl<'a> Reader<'a> {
             AnyCdr::LittleEndian(cdr) => (cdr.position(), if_little_endian(cdr)),
         };
         let len = self.len;
-        read.map_err(|cause| ReadError::Field(format!("{field} at byte {at} of {len}: {cause}")))
+        read.map_err(|cause| ReadError(format!("{field} at byte {at} of {len}: {cause}")))
     }
 
     pub(crate) fn u8(&mut self, field: &'static str) -> Result<u8, ReadError> {
@@ -108,7 +99,7 @@ impl<'a> Reader<'a> {
         let seconds = u64::try_from(sec).ok().filter(|_| nanosec < 1_000_000_000);
         let problem =
             || format!("header.stamp is {sec} s and {nanosec} ns, not a time from 1970 on");
-        let seconds = seconds.ok_or_else(|| ReadError::Field(problem()))?;
+        let seconds = seconds.ok_or_else(|| ReadError(problem()))?;
         let frame_id = self.str("header.frame_id")?;
         Ok((seconds * 1_000_000_000 + u64::from(nanosec), frame_id))
     }

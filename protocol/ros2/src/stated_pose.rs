@@ -29,11 +29,11 @@ impl StatedPose {
         let (_, frame_id) = message.header()?;
         if frame_id.trim_start_matches('/') != MAP_FRAME {
             let problem = format!("header.frame_id is {frame_id:?}, not {MAP_FRAME:?}");
-            return Err(ReadError::Field(problem));
+            return Err(ReadError(problem));
         }
         let world_from_base = message.pose("pose")?;
         let valid = world_from_base.validate();
-        valid.map_err(|error| ReadError::Field(format!("pose: {error}")))?;
+        valid.map_err(|error| ReadError(format!("pose: {error}")))?;
         let covariance: [f64; 36] = message.f64s("covariance")?;
         // Row-major 6 x 6: variances of x, y and yaw are at 0, 7 and 35.
         let [xx, .., yaw] = covariance;
@@ -53,7 +53,7 @@ fn std(index: usize, variance: f64) -> Result<f64, ReadError> {
     }
     // NaN is no variance.
     let problem = format!("covariance[{index}] is {variance}, not a variance");
-    Err(ReadError::Field(problem))
+    Err(ReadError(problem))
 }
 
 #[cfg(test)]

@@ -1,14 +1,14 @@
 //! The folders of the OPV2V family: `<root>/<split>/<scenario>/<agent>/<frame>.yaml` with a sweep beside it, entered at
 //! any level.
 
-use std::collections::{BTreeMap, BTreeSet, HashSet};
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 use protocol::CavId;
 
 use super::files::Listing;
 use super::frame_files::{AgentFolder, BIN, PCD, holds_pairs, yaml_ending};
-use super::keys::{self, Keys, LEAST_PER_STRAY};
+use super::keys::{self, Keys};
 use super::points::{SweepStorage, Sweeps};
 use super::problem::listed;
 use super::yaml::{self, Value, YamlField};
@@ -154,11 +154,8 @@ impl ScenarioFolder {
         let all: BTreeSet<&String> = by_agent.values().flat_map(|agent| &agent.stems).collect();
         let mut missing = Vec::new();
         for stem in &all {
-            let without = agents.iter().filter(|id| {
-                let agent = by_agent.get(id);
-                agent.is_some_and(|agent| !agent.stems.contains(*stem))
-            });
-            missing.extend(without.map(|id| MissingFrame::new(id, stem)));
+            let without = (by_agent.iter()).filter(|(_, agent)| !agent.stems.contains(*stem));
+            missing.extend(without.map(|(id, _)| MissingFrame::new(id, stem)));
         }
         let mut stems: Vec<String> = all.into_iter().cloned().collect();
         problems.extend(without_common_frame(dir, &agents, &by_agent));
@@ -204,22 +201,19 @@ impl ScenarioFolder {
 
     /// The reader of all agents' sweeps.
     pub(super) fn sweeps(&self, options: &OpenOptions) -> Sweeps {
-        let missing = self.missing.iter();
-        let missing = missing.map(|frame| (&frame.agent, frame.stem.as_str()));
-        let missing: HashSet<(&CavId, &str)> = missing.collect();
-        let sweeps = Sweeps::new(SweepStorage::ByName, options);
-        self.agents.iter().fold(sweeps, |sweeps, agent| {
+        let mut sweeps = Sweeps::new(SweepStorage::ByName, options);
+        for (agent, folder) in &self.by_agent {
             // Missing files are left out first: they would use up the tries.
-            let stems = self.stems.iter();
-            let stems = stems.filter(|stem| !missing.contains(&(agent, stem.as_str())));
+            let stems = (self.stems.iter()).filter(|stem| folder.stems.contains(*stem));
             let files = stems.map(|stem| self.pcd(agent, stem, None));
-            sweeps.with_agent(agent.clone(), files)
-        })
+            sweeps = sweeps.with_agent(agent.clone(), files);
+        }
+        sweeps
     }
 
     /// Capture times of all stems. Stems that are times give them, from the first on. Others count simulator ticks: if
-    /// `data_protocol.yaml` gives the length of a tick, time is tick times length; else the smallest step between stems
-    /// is one `period_nanos`, from 0 on, once strays are left out.
+    /// `data_protocol.yaml` gives the length of a tick, time is tick times length; else the usual step between stems is
+    /// one `period_nanos`, from 0 on.
     pub(super) fn ticks(&self, period_nanos: u64, problems: &mut Vec<ReadError>) -> Vec<Tick> {
         let tick_nanos = self.tick_nanos().unwrap_or_else(|error| {
             problems.push(error);
@@ -232,24 +226,16 @@ impl ScenarioFolder {
             Keys::Times(nanos) => nanos.clone(),
             _ => (0..stems.len()).map(|index| keys.count(index)).collect(),
         };
-        let mut frames: Vec<(&str, u64)> = stems.into_iter().zip(numbers).collect();
-        if tick_nanos.is_none() && !matches!(keys, Keys::Times(_)) {
-            problems.extend(self.leave_strays_out(&mut frames));
-        }
-        let numbers: Vec<u64> = frames.iter().map(|(_, number)| *number).collect();
         let first = numbers.iter().min().copied().unwrap_or(0);
+        let frames: Vec<(&str, u64)> = stems.into_iter().zip(numbers).collect();
         let (first, step, nanos) = match (&keys, tick_nanos) {
             (Keys::Times(_), _) => (first, 1, 1),
             (Keys::Numbers(_), Some(nanos)) => (0, 1, nanos),
-            _ => {
-                let steps = numbers.array_windows().map(|[a, b]| b.saturating_sub(*a));
-                let step = steps.filter(|&step| step > 0).min().unwrap_or(1);
-                (first, step, period_nanos)
-            }
+            _ => (first, self.usual_step(&frames, problems), period_nanos),
         };
         let ticks = frames.into_iter().map(|(stem, number)| {
-            let steps = number.saturating_sub(first) / step;
-            Tick::new(stem, steps.saturating_mul(nanos))
+            let since = number.saturating_sub(first);
+            Tick::new(stem, since.saturating_mul(nanos) / step)
         });
         let mut ticks: Vec<Tick> = ticks.collect();
         // Natural order compares fractions as whole numbers: 1.5 would come before 1.25.
@@ -268,25 +254,29 @@ impl ScenarioFolder {
         Some(ReadError::malformed(&self.dir, reason))
     }
 
-    /// Leaves out the few frames between two steps of the others: one alone would halve the step of all.
-    fn leave_strays_out(&self, frames: &mut Vec<(&str, u64)>) -> Option<ReadError> {
+    /// The step in the middle of those between frames. Where it is rare, as in a random choice of frames, and all others
+    /// are multiples of the smallest one, that is used.
+    fn usual_step(&self, frames: &[(&str, u64)], problems: &mut Vec<ReadError>) -> u64 {
         let steps = frames.array_windows();
         let steps = steps.map(|[(_, a), (_, b)]| b.saturating_sub(*a));
         let mut steps: Vec<u64> = steps.filter(|&step| step > 0).collect();
         steps.sort_unstable();
-        let step = *steps.get(steps.len() / 2)?;
-        // Where the one in the middle is the stray itself, all others are too many to leave out.
-        let (_, middle) = frames.get(frames.len() / 2)?;
-        let usual = middle % step;
-        let (kept, strays): (Vec<_>, Vec<_>) =
-            (frames.iter().copied()).partition(|(_, number)| number % step == usual);
-        if strays.is_empty() || strays.len() * LEAST_PER_STRAY > frames.len() {
-            return None;
+        let middle = steps.get(steps.len().saturating_sub(1) / 2);
+        let (Some(&least), Some(&usual), Some(most)) = (steps.first(), middle, steps.last()) else {
+            return 1;
+        };
+        let count = steps.iter().filter(|&&step| step == usual).count();
+        let is_unit = |unit: u64| steps.iter().all(|step| step % unit == 0);
+        if 2 * count <= steps.len() && is_unit(least) {
+            return least;
         }
-        *frames = kept;
-        let strays = listed(strays.into_iter().map(|(stem, _)| stem));
-        let reason = format!("between two steps of {step} of the other frames: left out: {strays}");
-        Some(ReadError::malformed(&self.dir, reason))
+        if !is_unit(usual) {
+            let reason = format!(
+                "frame numbers in steps of {least} to {most}: {usual}, the one in the middle, is taken for one period"
+            );
+            problems.push(ReadError::malformed(&self.dir, reason));
+        }
+        usual
     }
 
     /// The file that may state the length of a tick.
@@ -301,10 +291,9 @@ impl ScenarioFolder {
             return Ok(None);
         }
         let node = yaml::read(&path)?;
-        let Some(world) = YamlField::root(&path, &node).optional("world")? else {
-            return Ok(None);
-        };
-        let Some(delta) = world.optional("fixed_delta_seconds")? else {
+        let world = YamlField::root(&path, &node).optional("world")?;
+        let delta = world.map(|world| world.optional("fixed_delta_seconds"));
+        let Some(delta) = delta.transpose()?.flatten() else {
             return Ok(None);
         };
         let seconds = delta.number()?;
@@ -575,24 +564,48 @@ mod tests {
         assert_eq!((frames, last, problems.len()), (20, 1900, 0));
         frame(65);
         let (frames, last, problems) = times();
-        assert_eq!((frames, last, problems.len()), (20, 1900, 1));
+        assert_eq!((frames, last, problems.len()), (21, 2050, 1));
         let problem = problems[0].to_string();
-        assert!(
-            problem.ends_with("between two steps of 2 of the other frames: left out: 000065"),
-            "{problem}"
-        );
+        let end =
+            "frame numbers in steps of 2 to 3: 2, the one in the middle, is taken for one period";
+        assert!(problem.ends_with(end), "{problem}");
         frame(123_456_789);
         let (frames, last, problems) = times();
-        assert_eq!((frames, last, problems.len()), (20, 1900, 2));
+        assert_eq!((frames, last, problems.len()), (21, 2050, 2));
         let problem = problems[0].to_string();
         let end =
             "frame numbers of another order of magnitude than the others: left out: 123456789";
         assert!(problem.ends_with(end), "{problem}");
         fs::remove_file(dir.path().join("1/123456789.pcd")).unwrap();
-        // As many are off the step as are on it.
-        (0..20).for_each(|index| frame(109 + 2 * index));
-        let (frames, _, problems) = times();
-        assert_eq!((frames, problems.len()), (41, 0));
+        // One between two others would halve the step of all.
+        fs::remove_file(dir.path().join("1/000065.pcd")).unwrap();
+        frame(69);
+        let (frames, last, problems) = times();
+        let problem = problems[0].to_string();
+        assert_eq!((frames, last), (21, 1900), "{problem}");
+        // Frames chosen at random have the unit of the smallest step.
+        (0..20).for_each(|index| frame(110 + index * index));
+        let (frames, last, _) = times();
+        assert_eq!((frames, last), (41, 40_300));
+    }
+
+    #[test]
+    fn the_period_of_milliseconds_is_the_usual_step() {
+        let dir = tempfile::tempdir().unwrap();
+        for millis in [1000, 1103, 1198, 1300, 1401, 1440, 1600] {
+            let stem = format!("1/{millis:06}");
+            touch(
+                dir.path(),
+                &[&format!("{stem}.yaml"), &format!("{stem}.pcd")],
+            );
+        }
+        let mut problems = Vec::new();
+        let ticks = scan(dir.path()).0.ticks(100_000_000, &mut problems);
+        let times = ticks.iter().map(|tick| tick.capture_nanos / 1_000_000);
+        // In units of the usual step, 101.
+        let expected = [0, 101, 196, 297, 397, 435, 594];
+        assert_eq!(times.collect::<Vec<u64>>(), expected);
+        assert_eq!(problems.len(), 1, "{problems:?}");
     }
 
     #[test]

@@ -219,7 +219,7 @@ fn own_speed_mps(field: &YamlField<'_>, speed_mps: f64) -> Result<f64> {
 /// km/h to m/s. Related formats write a vector; its length is the speed.
 fn speed_mps_of_kmh(field: &YamlField<'_>) -> Result<f64> {
     let kmh = field.number().or_else(|error| {
-        let vector = field.array().map_err(|_| error)?.values;
+        let (_, vector) = field.array().map_err(|_| error)?;
         let squares = vector.iter().map(|component| component * component);
         Ok(squares.sum::<f64>().sqrt())
     });

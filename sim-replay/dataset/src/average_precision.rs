@@ -88,15 +88,6 @@ pub struct Tally {
 }
 
 impl Tally {
-    /// An empty tally.
-    pub fn new(iou_threshold: f64) -> Self {
-        Self {
-            iou_threshold,
-            matched: Vec::new(),
-            objects: 0,
-        }
-    }
-
     /// Adds a frame; returns the verdicts in the order of its detections.
     fn add(&mut self, frame: &FrameOverlaps, part: &PartMembers) -> Vec<Verdict> {
         let verdicts = frame.judge(part, self.iou_threshold);
@@ -150,10 +141,10 @@ impl Tally {
 /// per frame.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Scorer {
-    /// Of all objects.
-    tallies: Vec<Tally>,
-    /// Of parts of the objects.
-    parts: Vec<(Breakdown, Vec<Tally>)>,
+    /// Of all objects, one per threshold.
+    pub tallies: Vec<Tally>,
+    /// Of parts of the objects, one per threshold.
+    pub parts: Vec<(Breakdown, Vec<Tally>)>,
 }
 
 impl Default for Scorer {
@@ -165,8 +156,13 @@ impl Default for Scorer {
 impl Scorer {
     /// A scorer at the given overlaps.
     pub fn new(thresholds: &[f64]) -> Self {
+        let tallies = thresholds.iter().map(|&iou_threshold| Tally {
+            iou_threshold,
+            matched: Vec::new(),
+            objects: 0,
+        });
         Self {
-            tallies: thresholds.iter().copied().map(Tally::new).collect(),
+            tallies: tallies.collect(),
             parts: Vec::new(),
         }
     }
@@ -200,16 +196,6 @@ impl Scorer {
             .iter_mut()
             .map(|tally| tally.add(&frame, &all))
             .collect()
-    }
-
-    /// The tallies of all objects, one per threshold.
-    pub fn tallies(&self) -> &[Tally] {
-        &self.tallies
-    }
-
-    /// The tallies of parts of the objects, one per threshold.
-    pub fn parts(&self) -> &[(Breakdown, Vec<Tally>)] {
-        &self.parts
     }
 
     /// AP at every threshold, in their order; unknown without objects.

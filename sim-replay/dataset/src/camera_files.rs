@@ -55,13 +55,11 @@ pub(super) fn find(dir: &Path, stem: &str, number: u8) -> Result<PathBuf> {
         let reason = "there is no image of this camera, which has some of other frames";
         return Err(ReadError::malformed(&path, reason));
     };
-    match found.next() {
-        Some(other) => {
-            let reason = format!("camera {number} has another image, {}", other.display());
-            Err(ReadError::malformed(&image, reason))
-        }
-        None => Ok(image),
+    if let Some(other) = found.next() {
+        let reason = format!("camera {number} has another image, {}", other.display());
+        return Err(ReadError::malformed(&image, reason));
     }
+    Ok(image)
 }
 
 /// Reads an image; its calibration is that of the entry for the camera in `root`, if there is one.

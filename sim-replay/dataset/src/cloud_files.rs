@@ -18,7 +18,8 @@ const SEQUENCE_FOLDERS: [&str; 2] = ["velodyne_sync", "velodyne_left"];
 /// A file of one sweep, and its reader.
 #[derive(Debug, Clone)]
 pub struct CloudFile {
-    path: PathBuf,
+    /// Path of the file.
+    pub path: PathBuf,
     source: CloudSource,
 }
 
@@ -55,17 +56,12 @@ pub fn clouds_at(paths: &[PathBuf]) -> Vec<Result<CloudFile>> {
     }
     let mut folders = Folders::of(found.iter().flatten());
     let found = found.into_iter();
-    let sources = found.map(|listed| listed.map(|listed| folders.source_of(listed)));
-    sources.collect()
+    let opened = found.map(|file| file.map(|file| folders.opened(file)));
+    opened.collect()
 }
 
-/// A listed file.
-enum Listed {
-    File(PathBuf),
-    Known(CloudFile),
-}
-
-fn listed(path: &Path) -> Result<Vec<Listed>> {
+/// The files at a path; one that was not found as part of a data set is read by itself.
+fn listed(path: &Path) -> Result<Vec<CloudFile>> {
     let about = std::fs::metadata(path).map_err(|error| ReadError::io(path, error))?;
     let clouds = match about.is_dir() {
         true => clouds_in(path)?,
@@ -74,10 +70,14 @@ fn listed(path: &Path) -> Result<Vec<Listed>> {
         false => vec![path.to_owned()],
     };
     if !clouds.is_empty() {
-        return Ok(clouds.into_iter().map(Listed::File).collect());
+        let alone = |path| CloudFile {
+            path,
+            source: CloudSource::File(Arc::default()),
+        };
+        return Ok(clouds.into_iter().map(alone).collect());
     }
     let scenarios = crate::open(path)?.scenarios.into_iter();
-    let sweeps: Vec<Listed> = scenarios.flat_map(frames_of).map(Listed::Known).collect();
+    let sweeps: Vec<CloudFile> = scenarios.flat_map(frames_of).collect();
     if sweeps.is_empty() {
         let reason = "no cloud in it: expected files .pcd, .ply, .npy or .bin";
         return Err(ReadError::malformed(path, reason));
@@ -112,10 +112,10 @@ struct Folders {
 }
 
 impl Folders {
-    fn of<'a>(listed: impl Iterator<Item = &'a Listed>) -> Self {
+    fn of<'a>(listed: impl Iterator<Item = &'a CloudFile>) -> Self {
         let mut files: BTreeMap<PathBuf, Vec<PathBuf>> = BTreeMap::new();
-        for listed in listed {
-            if let Listed::File(path) = listed {
+        for CloudFile { path, source } in listed {
+            if matches!(source, CloudSource::File(_)) {
                 files.entry(folder_of(path)).or_default().push(path.clone());
             }
         }
@@ -130,11 +130,12 @@ impl Folders {
         }
     }
 
-    fn source_of(&mut self, listed: Listed) -> CloudFile {
-        let path = match listed {
-            Listed::Known(file) => return file,
-            Listed::File(path) => path,
-        };
+    /// The file with its reader.
+    fn opened(&mut self, file: CloudFile) -> CloudFile {
+        let CloudFile { path, source } = file;
+        if matches!(source, CloudSource::Frame(..)) {
+            return CloudFile { path, source };
+        }
         let known = scene_of(&path).and_then(|scene| {
             let frames = self.scenes.entry(scene.clone()).or_insert_with(|| {
                 // A folder may only look like a scene: then its files are read by themselves.
@@ -173,11 +174,6 @@ fn scene_of(path: &Path) -> Option<PathBuf> {
 }
 
 impl CloudFile {
-    /// Path of the file.
-    pub fn path(&self) -> &Path {
-        &self.path
-    }
-
     /// Reads the points.
     ///
     /// # Errors
@@ -276,7 +272,7 @@ mod tests {
                 .to_string()
                 .contains("none.pcd")
         );
-        assert_eq!(files[3].as_ref().unwrap().path(), folder.join("a.pcd"));
+        assert_eq!(files[3].as_ref().unwrap().path, folder.join("a.pcd"));
     }
 
     #[test]

@@ -60,7 +60,7 @@ pub enum EgoKind {
     /// The first vehicle; the first roadside unit if there is no vehicle.
     #[default]
     Vehicle,
-    /// The first roadside unit; the first vehicle if there is none.
+    /// The first roadside unit; a scenario without one is left out.
     Unit,
 }
 
@@ -114,7 +114,7 @@ impl EvaluationProtocol {
         }
     }
 
-    /// The scenario with the agents that take part, the ego first; none if no agent is of the requested kind.
+    /// The scenario with the agents that take part, the ego first; none if no agent or no ego is of the kind asked for.
     pub fn arrange(&self, scenario: &Scenario) -> Option<Scenario> {
         let (units, vehicles): (Vec<usize>, Vec<usize>) =
             (0..scenario.agents.len()).partition(|&index| {
@@ -125,6 +125,8 @@ impl EvaluationProtocol {
             (AgentKinds::Vehicles, _) => vehicles,
             (AgentKinds::Units, _) => units,
             (AgentKinds::All, EgoKind::Vehicle) => [vehicles, units].concat(),
+            // A vehicle is no ego of this protocol.
+            (AgentKinds::All, EgoKind::Unit) if units.is_empty() => units,
             (AgentKinds::All, EgoKind::Unit) => [units, vehicles].concat(),
         };
         // From the end: the ego and the first agents stay.

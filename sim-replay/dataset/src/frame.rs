@@ -83,12 +83,10 @@ impl Object {
 impl From<&TrueObject> for Object {
     /// An object of a message; a class of another version is [`ObjectClass::Other`].
     fn from(object: &TrueObject) -> Self {
+        let class = object.class.parse().unwrap_or(ObjectClass::Other);
         Self {
-            id: object.id,
-            class: object.class.parse().unwrap_or(ObjectClass::Other),
-            world_from_object: object.world_from_object,
-            size_m: object.size_m,
             speed_mps: object.speed_mps,
+            ..Self::new(object.id, class, object.world_from_object, object.size_m)
         }
     }
 }

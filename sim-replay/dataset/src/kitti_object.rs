@@ -97,11 +97,10 @@ impl FrameSource for Split {
     }
 
     fn frame_files(&self, _agent: &CavId, tick: &Tick) -> Vec<PathBuf> {
-        if !self.has_labels {
-            return Vec::new();
-        }
-        let folders = ["calib", "label_2"];
-        folders.map(|folder| self.file(folder, tick, "txt")).into()
+        let folders = ["calib", "label_2"].into_iter();
+        let folders = folders.filter(|_| self.has_labels);
+        let files = folders.map(|folder| self.file(folder, tick, "txt"));
+        files.collect()
     }
 
     fn points_path(&self, _agent: &CavId, tick: &Tick, _variant: Option<&str>) -> PathBuf {

@@ -24,6 +24,9 @@ pub(crate) static KITTI_ODOMETRY: LayoutRow = LayoutRow {
     reader: Some(LayoutReader::Sequence(is_sequence, open)),
 };
 
+/// Least number of whole times from 0 on, one apart, that are numbers of scans.
+const LEAST_COUNTED: usize = 3;
+
 /// True for a folder with scans and a calibration file.
 fn is_sequence(dir: &Path) -> bool {
     dir.join("calib.txt").is_file() && files::holds(&dir.join("velodyne"), ".bin")
@@ -32,12 +35,11 @@ fn is_sequence(dir: &Path) -> bool {
 /// Opens a sequence. Scans without time or pose are left out if others have them, and reported with their number.
 fn open(dir: &Path, options: &OpenOptions, problems: &mut Vec<ReadError>) -> Result<Scenario> {
     let velodyne = dir.join("velodyne");
-    let mut scans = scans(&velodyne, problems)?;
+    let mut scans = sequence::numbered::<usize>(&velodyne, "scan number", problems)?;
     let times = sequence::or_without("times", times(dir, &scans, problems), problems);
     let poses = sequence::or_without("poses", poses(dir, &scans, problems), problems);
-    let (of_times, of_poses) = (dir.join("times.txt"), poses_path(dir).unwrap_or_default());
-    keep_those_with(&mut scans, &of_times, times.as_deref(), problems);
-    keep_those_with(&mut scans, &of_poses, poses.as_deref(), problems);
+    keep_those_with(&mut scans, times.as_deref());
+    keep_those_with(&mut scans, poses.as_deref());
     let (mut joins, count) = (Vec::new(), scans.len());
     for (is_joined, what) in [(poses.is_some(), "poses"), (times.is_some(), "times")] {
         let line = format!("{count} {what} by number: the line is that of the scan");
@@ -61,33 +63,8 @@ fn open(dir: &Path, options: &OpenOptions, problems: &mut Vec<ReadError>) -> Res
     })
 }
 
-/// Number and stem of the scans, in order. Files of other names are left out, and further ones of one number.
-fn scans(velodyne: &Path, problems: &mut Vec<ReadError>) -> Result<Vec<(usize, String)>> {
-    let mut strays = Faults::default();
-    let listing = files::list(velodyne)?;
-    let scans = files::stems(&listing.files, ".bin").filter_map(|stem| {
-        let number = stem.parse::<usize>().map_err(|_| {
-            let path = velodyne.join(format!("{stem}.bin"));
-            ReadError::malformed(&path, format!("{stem:?} is no scan number"))
-        });
-        Some((strays.take(number)?, stem.to_owned()))
-    });
-    let mut scans: Vec<(usize, String)> = scans.collect();
-    // Of one number, the name with zeros in front comes first.
-    scans.sort_unstable();
-    scans.dedup_by(|(scan, stem), (before, kept)| {
-        if scan == before {
-            let path = velodyne.join(format!("{stem}.bin"));
-            let reason = format!("scan {scan} is {kept}.bin already");
-            strays.push(ReadError::malformed(&path, reason));
-        }
-        scan == before
-    });
-    strays.report("file", problems);
-    Ok(scans)
-}
-
-/// One value for each line of a file, whose number from 0 is that of the scan. Lines that cannot be read are reported.
+/// One value for each line of a file, whose number from 0 is that of the scan. Lines that cannot be read or are missing
+/// are reported, and lines beyond scans without a gap: scans of a part of a drive that were numbered anew look alike.
 ///
 /// # Errors
 /// [`ReadError`] if the file cannot be read, or has as many lines as there are scans, with other numbers.
@@ -99,58 +76,46 @@ fn of_lines<T>(
 ) -> Result<Vec<Option<T>>> {
     let mut faults = Faults::default();
     let rows = kitti_text::rows(path, &mut faults, read)?;
-    let numbers = scans.iter().map(|(scan, _)| *scan);
-    let (first, last) = (numbers.clone().min(), numbers.max());
+    let (lines, count) = (rows.len(), scans.len());
+    let last = scans.last().map_or(0, |(scan, _)| *scan);
     // As many lines as scans, but other numbers: by number, scans would get the lines of others.
-    if let (Some(first), Some(last)) = (first, last)
-        && rows.len() == scans.len()
-        && last >= rows.len()
-    {
+    if let Some((first, _)) = scans.first().filter(|_| lines == count && last >= lines) {
         let reason = format!(
-            "as many lines as scans, but scans are numbered {first} to {last} and lines 0 to {}: number the scans as the \
-             lines",
-            rows.len() - 1
+            "as many lines as scans, but scans are numbered {first} to {last} and lines from 0: number the scans as the \
+             lines"
         );
         return Err(ReadError::malformed(path, reason));
+    }
+    if lines > count && last < count {
+        let reason = format!(
+            "{lines} lines for {count} scans: those beyond the last scan are not used, and scans that were numbered anew \
+             have lines of others"
+        );
+        problems.push(ReadError::malformed(path, reason));
+    }
+    for (scan, _) in scans.iter().filter(|(scan, _)| *scan >= lines) {
+        let reason = format!("no line for scan {scan}: there are {lines}");
+        faults.push(ReadError::malformed(path, reason));
     }
     faults.report("scan", problems);
     Ok(rows)
 }
 
-/// Leaves out the scans beyond the last row of `path`, and those whose row could not be read, which is already
-/// reported.
-fn keep_those_with<T>(
-    scans: &mut Vec<(usize, String)>,
-    path: &Path,
-    rows: Option<&[Option<T>]>,
-    problems: &mut Vec<ReadError>,
-) {
+/// Leaves out the scans without a value, which are already reported.
+fn keep_those_with<T>(scans: &mut Vec<(usize, String)>, rows: Option<&[Option<T>]>) {
     let Some(rows) = rows else { return };
-    let mut faults = Faults::default();
-    scans.retain(|(scan, _)| match rows.get(*scan) {
-        Some(row) => row.is_some(),
-        None => {
-            let reason = format!("no line for scan {scan}: there are {}", rows.len());
-            faults.push(ReadError::malformed(path, reason));
-            false
-        }
-    });
-    faults.report("scan", problems);
+    scans.retain(|(scan, _)| rows.get(*scan).is_some_and(Option::is_some));
 }
 
 /// Path of the sequence's poses: beside the scans, or in the release's common folder.
 fn poses_path(dir: &Path) -> Option<PathBuf> {
-    let beside = ["poses.txt", "poses_cam0.txt"]
-        .map(|name| dir.join(name))
-        .into_iter()
-        .find(|path| path.is_file());
-    beside.or_else(|| {
-        files::names_of(dir).find_map(|dir| {
-            let name = dir.file_name()?.to_str()?;
-            let poses = dir.parent()?.parent()?.join("poses");
-            Some(poses.join(format!("{name}.txt"))).filter(|path| path.is_file())
-        })
-    })
+    let beside = ["poses.txt", "poses_cam0.txt"].map(|name| dir.join(name));
+    let common = files::names_of(dir).filter_map(|dir| {
+        let name = dir.file_name()?.to_str()?;
+        Some(dir.parent()?.parent()?.join(format!("poses/{name}.txt")))
+    });
+    let mut places = beside.into_iter().chain(common);
+    places.find(|path| path.is_file())
 }
 
 fn poses(
@@ -174,6 +139,9 @@ fn poses(
 }
 
 /// `times.txt`, one per line, in nanoseconds. Those that are not above all before are reported: a clock was set back.
+///
+/// # Errors
+/// [`ReadError`] for numbers of scans instead of times too.
 fn times(
     dir: &Path,
     scans: &[(usize, String)],
@@ -189,21 +157,19 @@ fn times(
             let reason = format!("{time}, expected a time from 0");
             return Err(kitti_text::malformed(&path, line, None, reason));
         }
-        Ok(time)
+        // KITTI's times have a fraction or an exponent.
+        Ok((time, text.trim() == (line - 1).to_string()))
     })?;
-    let known: Vec<f64> = times.iter().copied().flatten().collect();
-    let unit = Unit::of_file(&path, &known, problems);
-    let needed = scans.iter().map(|(scan, _)| scan + 1).max().unwrap_or(0);
-    if times.len() > needed {
-        let reason = format!(
-            "{} lines for {needed} scans: those beyond the last scan are not used",
-            times.len()
-        );
-        problems.push(ReadError::malformed(&path, reason));
+    let mut all = times.iter().copied();
+    if times.len() >= LEAST_COUNTED && all.all(|time| time.is_some_and(|(_, is_count)| is_count)) {
+        let reason = "numbers of scans, expected their times";
+        return Err(ReadError::malformed(&path, reason));
     }
+    let known: Vec<f64> = times.iter().flatten().map(|(time, _)| *time).collect();
+    let unit = Unit::of_file(&path, &known, problems);
     let (mut faults, mut latest) = (Faults::default(), -1.0);
     let later = (1..).zip(times).map(|(line, time)| {
-        let time = time?;
+        let (time, _) = time?;
         if time <= latest {
             let reason = format!("{time}, expected a time above {latest}, that of the scan before");
             faults.push(kitti_text::malformed(&path, line, None, reason));
@@ -335,7 +301,8 @@ mod tests {
             (
                 "0\n0.1\n0.2\n",
                 2,
-                "/times.txt: 3 lines for 2 scans: those beyond the last scan are not used",
+                "/times.txt: 3 lines for 2 scans: those beyond the last scan are not used, and scans that were numbered \
+                 anew have lines of others",
             ),
         ] {
             fs::write(dir.path().join("times.txt"), times).unwrap();
@@ -377,6 +344,11 @@ mod tests {
         ] {
             assert_eq!(millis(times), (expected.to_vec(), vec![]), "{times}");
         }
+        let (kept, problems) = millis("0\n1\n2\n");
+        let expected = "/times.txt: numbers of scans, expected their times: the sequence is read without times";
+        assert_eq!(kept, [0, 100, 200]);
+        assert_eq!(problems, [expected]);
+        assert_eq!(millis("0.0\n1.0\n2.0\n"), (vec![0, 1000, 2000], vec![]));
         let (kept, problems) = millis("0\n0.0001\n0.0002\n");
         assert_eq!((kept.len(), problems.len()), (3, 1));
         assert!(
@@ -413,7 +385,7 @@ mod tests {
         assert_eq!(stems(&dataset), ["000000", "000001"]);
         assert_eq!(
             problems_below(dir.path(), &dataset),
-            ["/velodyne/1.bin: scan 1 is 000001.bin already: the file is left out"]
+            ["/velodyne/1.bin: it has the scan number of 000001.bin: the file is left out"]
         );
     }
 
@@ -443,6 +415,23 @@ mod tests {
     }
 
     #[test]
+    fn lines_beyond_scans_without_a_gap_are_named() {
+        let dir = tempfile::tempdir().unwrap();
+        let poses = "1 0 0 0 0 1 0 0 0 0 1 0\n".repeat(5);
+        build(dir.path(), ".", "poses.txt", &poses);
+        let dataset = crate::open(dir.path()).unwrap();
+        let expected = "/poses.txt: 5 lines for 2 scans: those beyond the last scan are not used, and scans that were \
+                        numbered anew have lines of others";
+        assert_eq!(problems_below(dir.path(), &dataset), [expected]);
+        // A gap shows that scans have their own numbers.
+        let scans = dir.path().join("velodyne");
+        fs::rename(scans.join("000001.bin"), scans.join("000003.bin")).unwrap();
+        let dataset = crate::open(dir.path()).unwrap();
+        assert_eq!(stems(&dataset), ["000000", "000003"]);
+        assert_eq!(dataset.problems.len(), 0);
+    }
+
+    #[test]
     fn lines_that_may_be_of_other_scans_are_not_used() {
         let dir = tempfile::tempdir().unwrap();
         let pose = "1 0 0 0 0 1 0 0 0 0 1 0\n";
@@ -452,7 +441,7 @@ mod tests {
         for (poses, expected) in [
             (
                 pose.repeat(2),
-                "scans are numbered 1 to 2 and lines 0 to 1: number the scans as the lines",
+                "scans are numbered 1 to 2 and lines from 0: number the scans as the lines",
             ),
             (
                 format!("# poses\n{}", pose.repeat(3)),

@@ -43,11 +43,10 @@ pub(super) fn rows<T>(
     read: impl Fn(u64, &str) -> Result<T>,
 ) -> Result<Vec<Option<T>>> {
     let lines = counted_lines(path)?;
-    for (line, text) in &lines {
-        if text.trim_start().starts_with('#') {
-            let reason = "a comment, where the number of a line is that of a scan".to_owned();
-            return Err(malformed(path, *line, None, reason));
-        }
+    let mut texts = lines.iter();
+    if let Some((line, _)) = texts.find(|(_, text)| text.trim_start().starts_with('#')) {
+        let reason = "a comment, where the number of a line is that of a scan".to_owned();
+        return Err(malformed(path, *line, None, reason));
     }
     let values = lines.iter().map(|(line, text)| match text.trim() {
         "" => Err(malformed(path, *line, None, "the line is blank".to_owned())),
@@ -67,24 +66,17 @@ pub(super) fn numbers<const N: usize>(
     field: Option<&str>,
     text: &str,
 ) -> Result<[f64; N]> {
-    let (mut numbers, mut found) = ([0.0; N], 0_usize);
+    let mut numbers = Vec::with_capacity(N);
     for word in text.split_ascii_whitespace() {
         let number = word.parse().ok().filter(|number: &f64| number.is_finite());
-        let Some(number) = number else {
+        numbers.push(number.ok_or_else(|| {
             let reason = format!("{:?} is no finite number", excerpt(word, 40));
-            return Err(malformed(path, line, field, reason));
-        };
-        // Numbers beyond the last are only counted.
-        if let Some(place) = numbers.get_mut(found) {
-            *place = number;
-        }
-        found += 1;
+            malformed(path, line, field, reason)
+        })?);
     }
-    if found != N {
-        let reason = format!("{found} numbers, expected {N}");
-        return Err(malformed(path, line, field, reason));
-    }
-    Ok(numbers)
+    let found = numbers.len();
+    let reason = |_| malformed(path, line, field, format!("{found} numbers, expected {N}"));
+    <[f64; N]>::try_from(numbers).map_err(reason)
 }
 
 /// A rigid transform from a row-major 3x4 matrix.
@@ -105,10 +97,9 @@ impl Calibration {
     }
 
     fn numbers<const N: usize>(&self, name: &str) -> Result<(u64, [f64; N])> {
-        let Some((_, line, values)) = self.entries.iter().find(|(found, ..)| found == name) else {
-            let missing = ReadError::malformed_at(&self.path, None, Some(name), "missing");
-            return Err(missing);
-        };
+        let entry = self.entries.iter().find(|(found, ..)| found == name);
+        let missing = || ReadError::malformed_at(&self.path, None, Some(name), "missing");
+        let (_, line, values) = entry.ok_or_else(missing)?;
         Ok((*line, numbers(&self.path, *line, Some(name), values)?))
     }
 

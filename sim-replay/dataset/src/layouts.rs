@@ -1,8 +1,6 @@
 //! Table of the supported layouts: name, data sets, the files that identify them, and their readers. Messages and
 //! `--help` use it, and a folder is opened by it.
 
-use std::fmt::Write;
-
 use crate::layout::{Layout, LayoutRow};
 use crate::{
     cloud_sequence, dair, kitti_object, kitti_odometry, localization, nuscenes, opv2v_family,
@@ -61,17 +59,15 @@ impl Layout {
 
 /// One line per layout: name, data sets in brackets, and the files that identify it.
 pub fn layouts_text() -> String {
-    let mut text = String::new();
-    for row in &LAYOUTS {
+    let lines = LAYOUTS.iter().map(|row| {
         let (name, files) = (row.name, row.files);
         let data_sets = match row.data_sets {
             own if own == name => String::new(),
             data_sets => format!(" ({data_sets})"),
         };
-        // Writing to a String does not fail.
-        let _ = writeln!(text, "  {name}{data_sets}: {files}");
-    }
-    text
+        format!("  {name}{data_sets}: {files}\n")
+    });
+    lines.collect()
 }
 
 #[cfg(test)]

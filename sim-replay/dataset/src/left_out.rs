@@ -76,10 +76,8 @@ impl LeftOut {
     pub fn add_failed(&mut self, frame: &str, reason: &str) {
         self.failed += 1;
         self.keep([Problem {
-            path: String::new(),
-            line: None,
-            field: None,
             message: format!("{frame}: {reason}"),
+            ..Problem::default()
         }]);
     }
 

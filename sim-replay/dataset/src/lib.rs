@@ -79,7 +79,7 @@ mod v2v4real;
 mod written_pose;
 mod yaml;
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeSet, HashSet};
 use std::fmt::Display;
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -104,7 +104,6 @@ pub use unfinished::UNFINISHED;
 use crate::error::Result;
 use crate::frame::Frame;
 use crate::pcd::PcdCloud;
-use presence::AbsentFrames;
 
 /// A dataset, or the part of one that was opened.
 #[derive(Debug)]
@@ -180,7 +179,10 @@ pub struct Scenario {
     pub joins: Vec<String>,
     /// Agents whose recorded motion contradicts their recorded poses: it is not used.
     contradicted: BTreeSet<CavId>,
-    absent_at: AbsentFrames,
+    /// Pairs of agent and tick, by their indices, that have no frame.
+    absent_at: Arc<HashSet<(usize, usize)>>,
+    /// Capture times at which any agent has a frame, in order; none if they are the ticks.
+    moments: Option<Arc<Vec<Tick>>>,
     source: Arc<dyn FrameSource>,
 }
 
@@ -272,7 +274,8 @@ impl Scenario {
             source_handedness: Handedness::Right,
             joins: Vec::new(),
             contradicted: BTreeSet::new(),
-            absent_at: AbsentFrames::default(),
+            absent_at: Arc::default(),
+            moments: None,
             source,
         }
     }

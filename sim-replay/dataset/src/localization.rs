@@ -20,6 +20,7 @@ use protocol::Pose;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
+use super::faults::Faults;
 use super::hdf5_poses::{self, RowOrder};
 use super::keys::Keys;
 use super::kitti_text::{lines, numbers};
@@ -34,7 +35,8 @@ pub(crate) static NCLT: LayoutRow = LayoutRow {
     key: "nclt",
     name: "NCLT localization sequences",
     data_sets: "NCLT, as published or as LightLoc converts it",
-    files: "<day>/velodyne_sync/<microseconds>.bin, or <day>/velodyne_left/<microseconds>.bin in a folder named by a date",
+    files: "<day>/velodyne_sync/<microseconds>.bin, or <day>/velodyne_left/<microseconds>.bin in a folder named by a date \
+            of 2012 or 2013",
     protocol: "opv2v",
     reader: Some(LayoutReader::Sequence(is_sequence, open)),
 };
@@ -58,6 +60,8 @@ const RAW: &str = "velodyne_sync";
 const ALIGNED_POSES: &str = "velodyne_left_calibrateFalse.h5";
 /// Poses as LightLoc converts them.
 const PLAIN_POSES: &str = "velodyne_left_False.h5";
+/// The years of NCLT's days, with which the names of its sequences begin (`2012-01-22`).
+const NCLT_YEARS: [&str; 2] = ["2012-", "2013-"];
 /// LightLoc's names of the scenes.
 const SCENES: [&str; 3] = ["NCLT", "Oxford", "QEOxford"];
 
@@ -69,50 +73,26 @@ fn is_sequence(dir: &Path) -> bool {
 
 /// Opens a sequence. Sweeps without pose and poses without sweep are left out, the latter with a problem.
 fn open(dir: &Path, options: &OpenOptions, problems: &mut Vec<ReadError>) -> Result<Scenario> {
-    // Layout, storage and folder of the points. NCLT's sequences are named by the day (`2012-01-22`), Oxford's by day
-    // and time and more.
-    let is_nclt = dir.join(RAW).is_dir() || files::own_name(dir).len() == "2012-01-22".len();
+    // Layout, storage and folder of the points.
+    let name = files::own_name(dir);
+    let is_nclt = dir.join(RAW).is_dir() || NCLT_YEARS.iter().any(|year| name.starts_with(year));
     let (layout, storage, points) = match (is_nclt, files::holds(&dir.join(CONVERTED), ".bin")) {
         (true, true) => (Layout::NCLT, SweepStorage::ByName, CONVERTED),
         (true, false) => (Layout::NCLT, SweepStorage::NcltRaw, RAW),
         (false, _) => (Layout::OXFORD, SweepStorage::Planar, CONVERTED),
     };
     let points_dir = dir.join(points);
-    let mut stamps = BTreeMap::new();
-    for stem in files::stems(&files::list(&points_dir)?.files, ".bin") {
-        match stem.parse::<u64>() {
-            Ok(micros) => drop(stamps.insert(micros, stem.to_owned())),
-            Err(_) => {
-                let path = points_dir.join(format!("{stem}.bin"));
-                let reason = format!("{stem:?} is no time in microseconds: left out");
-                problems.push(ReadError::malformed(&path, reason));
-            }
-        }
-    }
+    let stamps = sequence::numbered::<u64>(&points_dir, "time in microseconds", problems)?;
+    let mut stamps: BTreeMap<u64, String> = stamps.into_iter().collect();
     let poses = poses(dir, storage, &stamps, problems);
     let poses = sequence::or_without("poses", poses, problems);
-    if let Some(poses) = &poses {
-        for micros in poses.keys().filter(|micros| !stamps.contains_key(micros)) {
-            let path = points_dir.join(format!("{micros}.bin"));
-            let reason = "does not exist, but there is a pose for it: left out";
-            problems.push(ReadError::malformed(&path, reason));
-        }
-        let before = stamps.len();
-        stamps.retain(|micros, _| poses.contains_key(micros));
-        if stamps.is_empty() && before > 0 {
-            let reason = format!("none of {before} sweeps has a pose: all left out");
-            problems.push(ReadError::malformed(dir, reason));
-        }
-    }
-    let join = format!("{} poses by time", stamps.len());
-    let join = poses.is_some().then_some(join);
+    let join = (poses.as_ref()).map(|poses| join(&points_dir, &mut stamps, poses, problems));
     let poses = poses.unwrap_or_default();
     let stems: Vec<&str> = stamps.values().map(String::as_str).collect();
-    let micros = stamps.keys();
     let times = match Keys::of_stems(&stems) {
         Keys::Times(nanos) => nanos,
         // Few digits: they count microseconds, as the layout states.
-        _ => micros.map(|micros| micros.saturating_mul(1000)).collect(),
+        _ => stamps.keys().map(|us| us.saturating_mul(1000)).collect(),
     };
     let clouds = stamps.into_iter().zip(times);
     let clouds = clouds.map(|((stamp, stem), nanos)| {
@@ -126,6 +106,34 @@ fn open(dir: &Path, options: &OpenOptions, problems: &mut Vec<ReadError>) -> Res
         joins: join.into_iter().collect(),
         ..sequence::scenario(layout, clouds, storage, files, options)
     })
+}
+
+/// Leaves out the sweeps without a pose, and says how many have one. Recordings begin before their poses and end after
+/// them: only sweeps between two poses are a problem, and all if there is no pose.
+fn join(
+    points_dir: &Path,
+    stamps: &mut BTreeMap<u64, String>,
+    poses: &BTreeMap<u64, Pose>,
+    problems: &mut Vec<ReadError>,
+) -> String {
+    for micros in poses.keys().filter(|micros| !stamps.contains_key(micros)) {
+        let path = points_dir.join(format!("{micros}.bin"));
+        let reason = "does not exist, but there is a pose for it: left out";
+        problems.push(ReadError::malformed(&path, reason));
+    }
+    let (all, mut faults) = (stamps.len(), Faults::default());
+    let span = poses.keys().next().zip(poses.keys().next_back());
+    stamps.retain(|micros, stem| {
+        let has_pose = poses.contains_key(micros);
+        if !has_pose && span.is_none_or(|(first, last)| (first..=last).contains(&micros)) {
+            let path = points_dir.join(format!("{stem}.bin"));
+            faults.push(ReadError::malformed(&path, "no pose of its time"));
+        }
+        has_pose
+    });
+    faults.report("sweep", problems);
+    let (count, without) = (stamps.len(), all - stamps.len());
+    format!("{count} poses by time, {without} sweeps without pose")
 }
 
 /// The poses of the best available file, relative to the mean of the training sequences if that is known, turned to z
@@ -153,10 +161,8 @@ fn poses(
         return Ok(None);
     };
     // The mean that LightLoc subtracts from all positions of a scene, in the axes of their file.
-    let middle = match middle_file(dir, scene) {
-        Some(path) => Isometry3::from(Translation3::from(first_row(&path)?)),
-        None => Isometry3::identity(),
-    };
+    let middle = middle_file(dir, scene).map(|path| first_row(&path));
+    let middle = Translation3::from(middle.transpose()?.unwrap_or_default());
     // z down to z up: half a turn about x.
     let turn = UnitQuaternion::from_axis_angle(&Vector3::x_axis(), std::f64::consts::PI);
     let turn = Isometry3::from_parts(Vector3::zeros().into(), turn);
@@ -470,6 +476,45 @@ mod tests {
                 .load(0, 0, &LoadOptions::default())
                 .unwrap();
             assert_eq!(frame.world_from_lidar, None, "not counted from elsewhere");
+        }
+    }
+
+    #[test]
+    fn a_sweep_without_pose_between_two_poses_is_a_problem() {
+        let dir = tempfile::tempdir().unwrap();
+        let (stamp, mut rows) = (1_326_652_795_280_148_u64, String::new());
+        // The last sweep is after the last pose, as in all recordings.
+        for (seconds, has_pose) in [(0, true), (2, false), (4, true), (9, false)] {
+            let micros = stamp + 1_000_000 * seconds;
+            let name = format!("2012-01-15/velodyne_sync/{micros}.bin");
+            write(dir.path(), &name, &[0x20, 0x4e, 0x20, 0x4e, 0, 0, 51, 3]);
+            if has_pose {
+                rows += &format!("{micros},0,0,-3,0,0,0\n");
+            }
+        }
+        let truth = "ground_truth/groundtruth_2012-01-15.csv";
+        write(dir.path(), truth, rows.as_bytes());
+        let dataset = open(dir.path());
+        let join = "2 poses by time, 2 sweeps without pose";
+        assert_eq!(dataset.scenarios[0].joins, [join]);
+        let problem = dataset.problems[0].to_string();
+        let expected = "/1326652797280148.bin: no pose of its time: the sweep is left out";
+        assert!(problem.ends_with(expected), "{problem}");
+        assert_eq!(dataset.problems.len(), 1);
+    }
+
+    #[test]
+    fn nclt_is_known_by_the_year_in_the_name() {
+        for (name, layout) in [
+            ("2012-01-15_a", Layout::NCLT),
+            ("2013-04-05", Layout::NCLT),
+            ("2019-01-11", Layout::OXFORD),
+            ("sequence_1", Layout::OXFORD),
+        ] {
+            let dir = tempfile::tempdir().unwrap();
+            let sweep = format!("{name}/velodyne_left/{T0}.bin");
+            write(dir.path(), &sweep, &floats(&[1.0; 4]));
+            assert_eq!(open(dir.path()).layout, layout, "{name}");
         }
     }
 

@@ -35,13 +35,9 @@ pub(super) fn find(dir: &Path, name: &str) -> Option<PathBuf> {
 /// whose time is not between their neighbours', are left out and reported.
 pub(super) fn read(path: &Path, problems: &mut Vec<ReadError>) -> Result<Trajectory> {
     let text = files::read_text(path, MAX_BYTES)?;
-    Ok(parse(path, &text, problems))
-}
-
-fn parse(path: &Path, text: &str, problems: &mut Vec<ReadError>) -> Trajectory {
     let mut faults = Faults::default();
     let mut rows = Vec::new();
-    for (number, record) in csv_file::records(text) {
+    for (number, record) in csv_file::records(&text) {
         let row = faults.take(row(path, number, &record)).flatten();
         rows.extend(row.map(|(micros, pose)| (number, micros, pose)));
     }
@@ -54,7 +50,7 @@ fn parse(path: &Path, text: &str, problems: &mut Vec<ReadError>) -> Trajectory {
         }
     }
     faults.report("row", problems);
-    poses
+    Ok(poses)
 }
 
 /// Time and pose of a row; `None` if it holds no pose.
@@ -97,8 +93,14 @@ mod tests {
 
     fn parse(text: &str) -> (Trajectory, Vec<String>) {
         let mut problems = Vec::new();
-        let truth = super::parse(Path::new("groundtruth_2012-01-15.csv"), text, &mut problems);
-        (truth, problems.iter().map(ToString::to_string).collect())
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("groundtruth_2012-01-15.csv");
+        std::fs::write(&path, text).unwrap();
+        let truth = read(&path, &mut problems).unwrap();
+        let root = format!("{}/", dir.path().display());
+        let problems = problems.iter();
+        let problems = problems.map(|problem| problem.to_string().replace(&root, ""));
+        (truth, problems.collect())
     }
 
     fn sound(text: &str) -> Trajectory {

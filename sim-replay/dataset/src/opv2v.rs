@@ -117,9 +117,7 @@ impl Opv2v {
 
     fn right_handed(&self, mut cloud: PcdCloud) -> PcdCloud {
         if self.handedness == Handedness::Left {
-            for [_, y, ..] in &mut cloud.points.xyzi {
-                *y = -*y;
-            }
+            cloud.points.mirror();
         }
         cloud
     }

@@ -8,15 +8,6 @@ use protocol::CavId;
 use super::{LoadOptions, MissingFrame, Problem, Scenario, Tick};
 use crate::frame::Frame;
 
-/// Absent agents by tick, and the capture times of all agents.
-#[derive(Debug, Clone, Default)]
-pub(super) struct AbsentFrames {
-    /// Pairs of agent and tick, by their indices, that have no frame.
-    pairs: Arc<HashSet<(usize, usize)>>,
-    /// Capture times at which any agent has a frame, in order; none if they are the ticks.
-    moments: Option<Arc<Vec<Tick>>>,
-}
-
 /// The frames of one tick that could be read.
 #[derive(Debug, Default)]
 pub struct LoadedTick {
@@ -56,9 +47,10 @@ impl Scenario {
         let pairs = missing.iter().filter_map(|frame| {
             Some((*agents.get(&frame.agent)?, *stems.get(frame.stem.as_str())?))
         });
-        let pairs = Arc::new(pairs.collect());
+        let absent_at = Arc::new(pairs.collect());
         Self {
-            absent_at: AbsentFrames { pairs, moments },
+            absent_at,
+            moments,
             ticks,
             missing,
             ..self
@@ -67,7 +59,7 @@ impl Scenario {
 
     /// True if an agent has a frame at a tick, by their indices in [`Self::agents`] and [`Self::ticks`].
     pub fn is_present(&self, agent_index: usize, tick_index: usize) -> bool {
-        !self.absent_at.pairs.contains(&(agent_index, tick_index))
+        !self.absent_at.contains(&(agent_index, tick_index))
     }
 
     /// Indices of the agents that have a frame at a tick, the ego first.
@@ -87,7 +79,7 @@ impl Scenario {
         let mut roadside_units = self.roadside_units.clone();
         roadside_units.retain(|unit| agents.contains(unit));
         // Not only the present ticks: the new ego may have frames where the old one has none.
-        let moments = self.absent_at.moments.clone();
+        let moments = self.moments.clone();
         Self {
             agents,
             roadside_units,
@@ -98,7 +90,7 @@ impl Scenario {
 
     /// Number of missing frames of agents other than the ego at its ticks.
     pub fn absent_frames(&self) -> usize {
-        let pairs = self.absent_at.pairs.iter();
+        let pairs = self.absent_at.iter();
         pairs.filter(|(_, tick)| *tick < self.ticks.len()).count()
     }
 

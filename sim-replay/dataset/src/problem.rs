@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 use super::ReadError;
 
 /// A fault of a data set that did not stop the reading: the part is left out, the rest is used.
-#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 pub struct Problem {
     /// The file or folder.
     pub path: String,

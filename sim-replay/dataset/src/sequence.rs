@@ -1,13 +1,17 @@
 //! Sequences of a single vehicle: a file per sweep, and the pose of its LiDAR where that is known.
 
 use std::collections::HashMap;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
+use std::str::FromStr;
 use std::sync::Arc;
 
 use protocol::{CavId, Handedness, Pose};
 
+use super::faults::Faults;
 use super::points::{SweepStorage, Sweeps};
-use super::{FrameSource, Layout, OpenOptions, ReadError, Result, Scenario, Tick, single_vehicle};
+use super::{
+    FrameSource, Layout, OpenOptions, ReadError, Result, Scenario, Tick, files, single_vehicle,
+};
 use crate::frame::Frame;
 use crate::pcd::PcdCloud;
 
@@ -45,6 +49,34 @@ pub(super) fn scenario(
         is_z_down: [Layout::NCLT, Layout::OXFORD].contains(&layout),
     };
     single_vehicle(layout, ticks, Arc::new(source))
+}
+
+/// Number and stem of the `.bin` files of a folder, in order; `what` is the meaning of their numbers. Files of other names
+/// are left out, and further ones of one number.
+pub(super) fn numbered<T: FromStr + Ord>(
+    dir: &Path,
+    what: &str,
+    problems: &mut Vec<ReadError>,
+) -> Result<Vec<(T, String)>> {
+    let mut strays = Faults::default();
+    let listing = files::list(dir)?;
+    let wrong = |stem: &str, reason| ReadError::malformed(&dir.join(format!("{stem}.bin")), reason);
+    let sweeps = files::stems(&listing.files, ".bin").filter_map(|stem| {
+        let number = stem.parse::<T>();
+        let number = number.map_err(|_| wrong(stem, format!("{stem:?} is no {what}")));
+        Some((strays.take(number)?, stem.to_owned()))
+    });
+    let mut sweeps: Vec<(T, String)> = sweeps.collect();
+    // Of one number, the name with zeros in front comes first.
+    sweeps.sort_unstable();
+    sweeps.dedup_by(|(number, stem), (before, kept)| {
+        if number == before {
+            strays.push(wrong(stem, format!("it has the {what} of {kept}.bin")));
+        }
+        number == before
+    });
+    strays.report("file", problems);
+    Ok(sweeps)
 }
 
 /// Values that a file gives for all scans; if it cannot be read, a problem and nothing.

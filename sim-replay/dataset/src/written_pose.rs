@@ -6,7 +6,7 @@ use protocol::Pose;
 
 use super::Result;
 use super::yaml::YamlField;
-use super::yaml::numpy_tags::{self, NumpyArray};
+use super::yaml::numpy_tags;
 use crate::carla_pose::CarlaPose;
 
 /// A pose in the numbers of its file.
@@ -21,7 +21,7 @@ pub(super) enum WrittenPose {
 impl WrittenPose {
     /// Reads six numbers, sixteen, or four rows of four: lists, arrays, or lists of arrays.
     pub(super) fn read(field: &YamlField<'_>) -> Result<Self> {
-        let NumpyArray { shape, values } = field.array()?;
+        let (shape, values) = field.array()?;
         if let Some(number) = values.iter().find(|number| !number.is_finite()) {
             return Err(field.error(format!("{number}, expected finite numbers")));
         }

@@ -25,16 +25,6 @@ pub enum LinkError {
     File(#[from] FileError),
 }
 
-impl LinkError {
-    /// The error with the path of the link's file, if it names no file yet.
-    pub(super) fn in_file(self, name: &str) -> Self {
-        match self {
-            Self::File(_) => self,
-            error @ Self::Value(_) => Self::File(FileError::new(name, error)),
-        }
-    }
-}
-
 /// Sharing of the medium.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]

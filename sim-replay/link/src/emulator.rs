@@ -12,6 +12,7 @@ use super::loss::LossState;
 use super::packet::Packet;
 use super::queue_server::{Departure, QueueServer, Rules};
 use super::trace::Trace;
+use support::file_error::AtFile;
 use support::nanos;
 use support::random::{SplitMix64, derive_seed};
 
@@ -83,7 +84,7 @@ impl LinkEmulator {
     /// [`LinkError`] with the file and its fault.
     pub fn open(name: &str, seed: u64) -> Result<Self, LinkError> {
         let (config, folder) = LinkConfig::open(name)?;
-        Self::new(config, &folder, seed).map_err(|error| error.in_file(name))
+        Ok(Self::new(config, &folder, seed).at(Path::new(name))?)
     }
 
     /// The emulator of a configuration; paths of traces start at `folder`. The same seed gives the same results.
@@ -185,15 +186,11 @@ impl LinkEmulator {
             Departure::Dropped(packet, reason) => {
                 self.schedule(self.now_nanos, packet, Delivery::Dropped(reason))
             }
-            Departure::Sent {
-                packet,
-                start_nanos,
-                end_nanos,
-            } => self.propagate(packet, start_nanos, end_nanos),
+            Departure::Sent(packet, sent_nanos) => self.propagate(packet, sent_nanos),
         }
     }
 
-    fn propagate(&mut self, packet: Packet, start_nanos: u64, end_nanos: u64) {
+    fn propagate(&mut self, packet: Packet, [start_nanos, end_nanos]: [u64; 2]) {
         let config = &self.config;
         let step = self.trace.as_ref().and_then(|trace| trace.at(end_nanos));
         // By direction even on a shared medium: losses and order concern one pair of vehicles.

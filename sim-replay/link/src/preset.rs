@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use super::config::{LinkConfig, LinkError};
-use protocol::config::FieldError;
+use bus::config_file;
 use support::bounded_file;
 use support::file_error::{AtFile, FileError};
 
@@ -44,22 +44,24 @@ impl LinkConfig {
     /// # Errors
     /// [`LinkError`] with the file and its fault.
     pub fn open(name: &str) -> Result<(Self, PathBuf), LinkError> {
-        let names = PRESETS.map(|(preset, _)| preset);
-        if names.contains(&name) {
+        if let Some(preset) = Self::preset(name) {
             // No preset refers to a file, so its folder is never used.
-            return Ok((Self::preset(name)?, PathBuf::from(".")));
+            return Ok((preset, PathBuf::from(".")));
         }
         let path = PathBuf::from(name);
         let text = bounded_file::read_text(&path, MAX_BYTES).map_err(|error| {
-            let names = names.join(", ");
+            let names = PRESETS.map(|(preset, _)| preset).join(", ");
             let problem = format_args!(
                 "neither a preset of a link ({names}) nor a file that can be read: {error}"
             );
             FileError::new(&path, problem)
         })?;
-        let config: Self = serde_saphyr::from_str(&text).at(&path)?;
-        let checked = config.validate().map_err(LinkError::from);
-        checked.map_err(|error| error.in_file(name))?;
+        // As a link it would be one without limits.
+        if text.trim().is_empty() {
+            return Err(FileError::new(&path, "empty; name the preset ideal instead").into());
+        }
+        let config: Self = config_file::parse(&text, &path)?;
+        config.validate().map_err(LinkError::from).at(&path)?;
         let folder = path.parent().unwrap_or(Path::new(".")).to_path_buf();
         Ok((config, folder))
     }
@@ -70,24 +72,36 @@ impl LinkConfig {
         serde_saphyr::to_string(self).unwrap_or_default()
     }
 
-    /// A published link model, by name.
-    ///
-    /// # Errors
-    /// [`LinkError::Value`] lists the available names.
-    pub fn preset(name: &str) -> Result<Self, LinkError> {
+    /// A published link model, by its name of [`PRESETS`].
+    pub fn preset(name: &str) -> Option<Self> {
         let links = serde_saphyr::from_str::<BTreeMap<String, Self>>(LINKS);
-        let mut links = links.expect("a test reads every preset");
-        links.remove(name).ok_or_else(|| {
-            let known = PRESETS.map(|(name, _)| name).join(", ");
-            let name: String = name.chars().take(40).collect();
-            FieldError::new("preset", name, format!("unknown, there are {known}")).into()
-        })
+        links.expect("a test reads every preset").remove(name)
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_wrong_file_is_refused_with_its_field_and_value() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("link.yaml");
+        let open = |text: &str| {
+            std::fs::write(&path, text).unwrap();
+            LinkConfig::open(&path.display().to_string())
+        };
+        for (text, part) in [
+            ("", "link.yaml: empty"),
+            ("latency: {constant_ms: 5ms}", "link.yaml:1: latency"),
+            ("latency: {constant_ms: 5ms}", "constant_ms: 5ms"),
+            ("latency: {constant_ms: -5}", "link: latency is -5"),
+        ] {
+            let message = open(text).unwrap_err().to_string();
+            assert!(message.contains(part), "{message}");
+        }
+        assert_eq!(open("{}").unwrap().0, LinkConfig::default());
+    }
 
     #[test]
     fn every_preset_is_sound() {
@@ -101,7 +115,8 @@ mod tests {
                 link.to_yaml()
             );
         }
-        let message = LinkConfig::preset("6g").unwrap_err().to_string();
+        assert_eq!(LinkConfig::preset("6g"), None);
+        let message = LinkConfig::open("6g").unwrap_err().to_string();
         assert!(
             PRESETS.iter().all(|(name, _)| message.contains(name)),
             "{message}"

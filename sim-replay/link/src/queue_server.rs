@@ -32,12 +32,8 @@ struct Sending {
 /// A packet that leaves the queue.
 #[derive(Debug, Clone)]
 pub(super) enum Departure {
-    /// Times at which its first and its last bit were sent.
-    Sent {
-        packet: Packet,
-        start_nanos: u64,
-        end_nanos: u64,
-    },
+    /// The packet, and the times at which its first and its last bit were sent, nanoseconds.
+    Sent(Packet, [u64; 2]),
     /// The packet was dropped when another was submitted, or on its own submission.
     Dropped(Packet, DropReason),
 }
@@ -55,11 +51,7 @@ impl QueueServer {
     pub(super) fn submit(&mut self, packet: Packet, rules: &Rules, left: &mut Vec<Departure>) {
         let nanos = packet.submitted_nanos;
         if rules.capacity == ServiceCurve::Unlimited {
-            left.push(Departure::Sent {
-                packet,
-                start_nanos: nanos,
-                end_nanos: nanos,
-            });
+            left.push(Departure::Sent(packet, [nanos; 2]));
             return;
         }
         // Before the limits of the queue: an idle sender takes a packet of any size.
@@ -105,11 +97,8 @@ impl QueueServer {
                 false => self.sending.take(),
             };
             let Some(sent) = sent else { return };
-            left.push(Departure::Sent {
-                packet: sent.packet,
-                start_nanos: sent.start_nanos,
-                end_nanos,
-            });
+            let sent_nanos = [sent.start_nanos, end_nanos];
+            left.push(Departure::Sent(sent.packet, sent_nanos));
             // Urgent packets share the rate with the one being sent and do not free the sender.
             if !is_urgent && let Some(next) = self.waiting.pop_front() {
                 self.waiting_bytes -= next.bytes;

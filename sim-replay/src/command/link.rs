@@ -76,9 +76,12 @@ fn forward(args: ForwardArgs) -> anyhow::Result<Outcome> {
     let emulator = emulator.map_err(BadInput::of)?;
     let (stop, bus) = join(&config.bus, &config.run, Role::Link, &config.ego)?;
     let options = NodeOptions {
+        ego: config.ego,
+        streams: config.streams,
         keeps_running: config.keep_running || config.bus.supervised,
+        // 1 GiB in flight.
+        max_kept_bytes: 1 << 30,
         inbox: config.inbox.limits(),
-        ..NodeOptions::new(config.ego, config.streams)
     };
     let report = link_node::run(&bus, emulator, &options, &stop)?;
     print(&report, args.json)?;

@@ -15,9 +15,8 @@ pub(crate) fn run(args: ProcessArgs<RecorderConfig>) -> anyhow::Result<Outcome> 
     let config = args.config.validated()?;
     let name = CavId::new("recorder")?;
     let (stop, bus) = join(&config.bus, &config.run, Role::Recorder, &name)?;
-    let options = config.options();
     // A failure is reported at once to a process that waits for the report; the last line is the final report.
-    let report = recorder::record(&bus, &options, &stop, &mut |report: &RecordReport| {
+    let report = recorder::record(&bus, &config, &stop, &mut |report: &RecordReport| {
         if args.json && print_json(report).is_err() {
             tracing::error!("the failure cannot be printed");
         }

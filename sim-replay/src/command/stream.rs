@@ -26,7 +26,7 @@ pub(crate) fn run(args: ProcessArgs<ReplayConfig>) -> anyhow::Result<Outcome> {
     let replay = match Replay::prepare(&bus, &scenario, config.options(), &stop) {
         Ok(replay) => replay,
         // Failures of the run. All other errors are faults of the input, exit code 2.
-        Err(error @ (StreamError::Bus(_) | StreamError::Thread(_))) => return Err(error.into()),
+        Err(error @ StreamError::Bus(_)) => return Err(error.into()),
         Err(error) => return Ok(Outcome::bad_input(&error)),
     };
     match replay.wait_until_ready() {

@@ -7,7 +7,6 @@ use protocol::{RunId, Stream};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use crate::recorder::RecorderOptions;
 use bus::{BusConfig, ProcessConfig};
 use recording::{Contents, RecordingOptions};
 
@@ -82,17 +81,5 @@ impl ProcessConfig for RecorderConfig {
     fn validate(&self) -> Result<(), FieldError> {
         self.record.validate()?;
         self.bus.validate()
-    }
-}
-
-impl RecorderConfig {
-    /// The options of the recorder.
-    pub fn options(&self) -> RecorderOptions {
-        RecorderOptions {
-            out: self.out.clone(),
-            recording: self.record.options(),
-            without: self.record.without.clone(),
-            keeps_running: self.keep_running || self.bus.supervised,
-        }
     }
 }

@@ -5,7 +5,7 @@ use std::path::Path;
 
 use serde::Serialize;
 
-use simulator::map::{Finding, Map, read_map};
+use simulator::map::{Finding, read_map};
 use support::file_error::FileError;
 
 /// Contents of an OpenDRIVE map. Serializes to the JSON of `sim-replay inspect --json MAP.xodr`, prints as its table.
@@ -42,7 +42,7 @@ pub struct MapReport {
 /// # Errors
 /// [`FileError`] if the file cannot be read or is no usable map.
 pub fn inspect_map(path: &Path) -> Result<MapReport, FileError> {
-    let Map { network, lanes } = read_map(path)?;
+    let (network, lanes) = read_map(path)?;
     let (roads, lanes) = (&network.roads, &lanes.lanes);
     let points = lanes.iter().flat_map(|lane| &lane.centerline);
     let heights = points.map(|point| point[2]);

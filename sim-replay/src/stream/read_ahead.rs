@@ -11,19 +11,11 @@ use support::sync::spawn;
 /// The frames of one tick, one for each requested agent, in that order.
 pub(crate) type TickFrames = Vec<Result<Frame, ReadError>>;
 
-/// A tick to be read.
-struct Request {
-    tick: usize,
-    frames: Sender<TickFrames>,
-    /// Dead if the tick is no longer requested.
-    is_wanted: Weak<()>,
-}
+/// A tick to be read, where its frames are sent, and a mark that is dead if it is no longer requested.
+type Request = (usize, Sender<TickFrames>, Weak<()>);
 
-/// A tick that was requested.
-struct Awaited {
-    frames: Receiver<TickFrames>,
-    _is_wanted: Arc<()>,
-}
+/// The frames of a tick that was requested, and the mark that it is.
+type Awaited = (Receiver<TickFrames>, Arc<()>);
 
 /// A thread that reads the requested ticks, in order, and keeps no others. It ends with this value.
 pub(crate) struct ReadAhead {
@@ -43,13 +35,13 @@ impl ReadAhead {
     ) -> std::io::Result<Self> {
         let (requests, received) = channel::<Request>();
         spawn("read ahead", move || {
-            for request in received {
+            for (tick, sender, is_wanted) in received {
                 // The tick may no longer be requested after a jump.
-                if request.is_wanted.strong_count() > 0 {
+                if is_wanted.strong_count() > 0 {
                     let agents = agents.iter();
-                    let frames = agents.map(|&agent| scenario.load(agent, request.tick, &options));
+                    let frames = agents.map(|&agent| scenario.load(agent, tick, &options));
                     // Nobody receives them if the jump came meanwhile.
-                    let _ = request.frames.send(frames.collect());
+                    let _ = sender.send(frames.collect());
                 }
             }
         })?;
@@ -71,22 +63,14 @@ impl ReadAhead {
     /// The frames of a tick, as soon as they are read; empty if the reading thread has ended.
     pub(crate) fn take(&mut self, tick: usize) -> TickFrames {
         let awaited = self.awaited.remove(&tick);
-        let awaited = awaited.unwrap_or_else(|| request(&self.requests, tick));
-        awaited.frames.recv().unwrap_or_default()
+        let (frames, _is_wanted) = awaited.unwrap_or_else(|| request(&self.requests, tick));
+        frames.recv().unwrap_or_default()
     }
 }
 
 fn request(requests: &Sender<Request>, tick: usize) -> Awaited {
     let ((sender, frames), wanted) = (channel(), Arc::new(()));
-    let request = Request {
-        tick,
-        frames: sender,
-        is_wanted: Arc::downgrade(&wanted),
-    };
     // Without the thread nothing is sent, and the receiver notices.
-    let _ = requests.send(request);
-    Awaited {
-        frames,
-        _is_wanted: wanted,
-    }
+    let _ = requests.send((tick, sender, Arc::downgrade(&wanted)));
+    (frames, wanted)
 }

@@ -12,7 +12,7 @@ use super::checkpoint::{Checkpoint, Place};
 use super::read_ahead::{ReadAhead, TickFrames};
 use super::report::StreamReport;
 use super::schedule::{Planned, Schedule};
-use super::sensor_link::{DelayedSweep, SensorLink};
+use super::sensor_link::{SensorLink, Sweep};
 use super::sensor_publisher::{SensorPublisher, truth_of};
 use bus::bounded_queue::Pop;
 use bus::shutdown::Stop;
@@ -64,26 +64,6 @@ pub struct StreamOptions {
     pub checkpoint: Option<PathBuf>,
 }
 
-impl Default for StreamOptions {
-    fn default() -> Self {
-        Self {
-            agents: Vec::new(),
-            rate: 1.0,
-            repeats: false,
-            seek: 0,
-            frames: None,
-            load: LoadOptions::default(),
-            await_agents: true,
-            expect: Vec::new(),
-            ready_timeout: Duration::from_secs(60),
-            lockstep: Vec::new(),
-            answer_timeout: Duration::from_secs(60),
-            link: None,
-            checkpoint: None,
-        }
-    }
-}
-
 impl StreamOptions {
     /// The options that give the order of ticks, as text.
     fn plan(&self) -> String {
@@ -102,24 +82,16 @@ impl StreamOptions {
 #[derive(Debug, thiserror::Error)]
 pub enum StreamError {
     /// The options do not fit each other or the scenario: a vehicle or tick that it does not have, an invalid rate, or a
-    /// link in lockstep, where a lost frame is never answered. The message names what was asked and what there is.
+    /// link in lockstep, where a lost frame is never answered; an invalid link or checkpoint. The message names what was
+    /// asked and what there is.
     #[error("{0}")]
     Options(String),
-    /// The link is invalid.
-    #[error(transparent)]
-    Link(#[from] LinkError),
-    /// The checkpoint is invalid.
-    #[error("checkpoint: {0}")]
-    Checkpoint(#[from] FileError),
     /// Not every route is up.
     #[error("the fleet is not ready: {0}")]
     NotReady(#[from] NotReady),
-    /// The bus failed.
+    /// The bus failed, or a thread could not be started.
     #[error(transparent)]
     Bus(#[from] BusError),
-    /// A thread could not be started.
-    #[error("no thread for reading ahead or writing checkpoints: {0}")]
-    Thread(std::io::Error),
 }
 
 /// A replay of a scene.
@@ -165,7 +137,9 @@ impl<'a> Replay<'a> {
         };
         let scene = (scenario.name.as_str(), scenario.ticks.len());
         let read = |path: &PathBuf| Place::read(path, scene, &options.plan());
-        let place = options.checkpoint.as_ref().map(read).transpose()?.flatten();
+        let place = options.checkpoint.as_ref().map(read).transpose();
+        let invalid = |error: FileError| StreamError::Options(format!("checkpoint: {error}"));
+        let place = place.map_err(invalid)?.flatten();
         let (seek, frames) = (options.seek, options.frames);
         let mut schedule = Schedule::new(&scenario.ticks, seek, frames, options.repeats);
         if let Some(place) = &place {
@@ -176,7 +150,7 @@ impl<'a> Replay<'a> {
             clock.pause();
         }
         let mut reading = ReadAhead::start(scenario.clone(), agents, options.load.clone())
-            .map_err(StreamError::Thread)?;
+            .map_err(BusError::thread("reading ahead"))?;
         reading.want(&schedule.ahead(READ_AHEAD));
 
         let inbox = bus.inbox(COMMANDS, 16);
@@ -190,13 +164,14 @@ impl<'a> Replay<'a> {
         let subscriptions = topics.map(|topic| bus.subscribe(topic, &inbox));
         let link = options.link.as_ref();
         let sensor_link = link.map(|(link, seed)| SensorLink::new(link, *seed));
-        let sensor_link = sensor_link.transpose()?;
-        let checkpoint = options.checkpoint.clone().map(Checkpoint::open);
+        let invalid = |error: LinkError| StreamError::Options(error.to_string());
+        let sensor_link = sensor_link.transpose().map_err(invalid)?;
+        let checkpoint = options.checkpoint.clone().map(Checkpoint::open).transpose();
         Ok(Self {
             bus,
             scenario: scenario.name.clone(),
             tick_count: scenario.ticks.len(),
-            checkpoint: checkpoint.transpose().map_err(StreamError::Thread)?,
+            checkpoint: checkpoint.map_err(BusError::thread("writing checkpoints"))?,
             is_resumed: place.is_some(),
             reading,
             schedule,
@@ -303,7 +278,8 @@ impl<'a> Replay<'a> {
         loop {
             // A command may change the next tick, so the plan is renewed each time.
             let planned = self.schedule.clone().next()?;
-            let due = self.clock.due(planned.capture_nanos, Instant::now());
+            let due_nanos = planned.capture_nanos.saturating_sub(planned.gap_nanos);
+            let due = self.clock.due(due_nanos, Instant::now());
             self.deliver();
             if let Some(due) = due.filter(|due| *due <= Instant::now() && !self.stop.requested()) {
                 self.schedule.next();
@@ -335,8 +311,7 @@ impl<'a> Replay<'a> {
         let link = self.sensor_link.as_mut();
         let arrived = link.map(|link| link.arrived(Instant::now()));
         for sweep in arrived.unwrap_or_default() {
-            self.publisher
-                .submit(sweep.agent, sweep.capture_nanos, sweep.frame);
+            self.publisher.submit(sweep);
         }
     }
 
@@ -392,16 +367,14 @@ impl<'a> Replay<'a> {
             match frame {
                 Ok(frame) => {
                     self.report.parts_left_out(&frame);
+                    let sweep = Sweep {
+                        agent,
+                        capture_nanos,
+                        frame,
+                    };
                     match &mut self.sensor_link {
-                        None => self.publisher.submit(agent, capture_nanos, frame),
-                        Some(link) => {
-                            let sweep = DelayedSweep {
-                                agent,
-                                capture_nanos,
-                                frame,
-                            };
-                            link.submit(sweep, Instant::now());
-                        }
+                        None => self.publisher.submit(sweep),
+                        Some(link) => link.submit(sweep, Instant::now()),
                     }
                 }
                 Err(error) if error.is_absent() => self.report.absent_frames += 1,
@@ -503,7 +476,21 @@ mod tests {
 
     #[test]
     fn the_options_that_give_the_order_of_ticks_are_in_the_plan() {
-        let whole = StreamOptions::default();
+        let whole = StreamOptions {
+            agents: Vec::new(),
+            rate: 1.0,
+            repeats: false,
+            seek: 0,
+            frames: None,
+            load: LoadOptions::default(),
+            await_agents: true,
+            expect: Vec::new(),
+            ready_timeout: Duration::ZERO,
+            lockstep: Vec::new(),
+            answer_timeout: Duration::ZERO,
+            link: None,
+            checkpoint: None,
+        };
         let part = StreamOptions {
             seek: 5,
             frames: Some(40),

@@ -8,6 +8,11 @@ use dataset::Tick;
 
 /// Period of a scene with only one tick, nanoseconds.
 const SINGLE_TICK_PERIOD: u64 = 100_000_000;
+/// Gap of capture time at a jump back, nanoseconds, by which vehicles see it: more than the 60 s over which a tracked pose
+/// may be predicted. Object tracks and feature memories last for less.
+const JUMP_NANOS: u64 = 61_000_000_000;
+/// Longest jump back without a gap, periods: trackers follow one so short, and small scenes would be gaps for the most part.
+const SHORT_JUMP: u64 = 10;
 
 /// One tick to be published.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -16,6 +21,8 @@ pub struct Planned {
     pub tick_index: usize,
     /// Capture time on the clock of the replay, nanoseconds: the recorded one until the first jump back.
     pub capture_nanos: u64,
+    /// Part of the step to that time which takes no time: the gap of a jump back, nanoseconds.
+    pub gap_nanos: u64,
 }
 
 /// State of a schedule.
@@ -35,8 +42,8 @@ pub struct Position {
 /// The order of ticks with seeking, looping and a limit. Iterating over a clone gives the ticks ahead.
 ///
 /// Capture times always rise, as if the vehicles drove on: a receiver that pairs by capture time must not get one
-/// twice. After a jump back (a loop, or a seek) all times are shifted so that the next tick follows the last at the
-/// scene's pace.
+/// twice. After a jump back (a loop, or a seek) all times are shifted so that the next tick follows the last, by a period
+/// of the scene and, after more than [`SHORT_JUMP`] periods, the gap by which vehicles end what they track.
 #[derive(Debug, Clone)]
 pub struct Schedule {
     captures: Arc<[u64]>,
@@ -94,11 +101,15 @@ impl Iterator for Schedule {
         }
         let tick_index = self.position.next_tick;
         let recorded = *self.captures.get(tick_index)?;
+        let back_to = recorded.saturating_add(self.position.shift_nanos);
+        let mut gap_nanos = 0;
         if let Some(last) = self.position.last_nanos
-            && recorded.saturating_add(self.position.shift_nanos) <= last
+            && let Some(back_nanos) = last.checked_sub(back_to)
         {
             let period_nanos = median_step_nanos(&self.captures).unwrap_or(SINGLE_TICK_PERIOD);
-            self.position.shift_nanos = last.saturating_add(period_nanos).saturating_sub(recorded);
+            gap_nanos = JUMP_NANOS * u64::from(back_nanos / period_nanos > SHORT_JUMP);
+            let step_nanos = period_nanos.saturating_add(gap_nanos);
+            self.position.shift_nanos = last.saturating_add(step_nanos).saturating_sub(recorded);
         }
         let capture_nanos = recorded.saturating_add(self.position.shift_nanos);
         self.position.next_tick += 1;
@@ -107,6 +118,7 @@ impl Iterator for Schedule {
         Some(Planned {
             tick_index,
             capture_nanos,
+            gap_nanos,
         })
     }
 }
@@ -158,6 +170,25 @@ mod tests {
             plan(Schedule::new(&ticks(&[7]), 0, None, true), 2),
             [(0, 7), (0, 100_000_007)]
         );
+    }
+
+    #[test]
+    fn vehicles_see_a_long_jump_back_by_a_gap_that_takes_no_time() {
+        let captures: Vec<u64> = (1..=12).map(|tick| tick * 100).collect();
+        let ticks = ticks(&captures);
+        let mut schedule = Schedule::new(&ticks, 0, None, true);
+        let gaps: Vec<u64> = { schedule.by_ref().take(36) }
+            .map(|planned| planned.gap_nanos)
+            .collect();
+        for (tick, gap_nanos) in gaps.into_iter().enumerate() {
+            let is_lap = tick > 0 && tick % 12 == 0;
+            assert_eq!(gap_nanos, if is_lap { JUMP_NANOS } else { 0 }, "{tick}");
+        }
+        let last = 3 * 1200 + 2 * JUMP_NANOS;
+        assert_eq!(plan(&mut schedule, 1), [(0, last + 100 + JUMP_NANOS)]);
+        // Ten periods back are a short jump.
+        let short = Schedule::new(&ticks[..11], 10, None, true);
+        assert_eq!(plan(short, 2), [(10, 1100), (0, 1200)]);
     }
 
     #[test]

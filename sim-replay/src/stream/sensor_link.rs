@@ -25,9 +25,9 @@ pub struct SensorLinkReport {
     pub dropped: BTreeMap<DropReason, u64>,
 }
 
-/// A frame in flight.
+/// A frame on its way to its agent.
 #[derive(Debug, Clone)]
-pub(super) struct DelayedSweep {
+pub(super) struct Sweep {
     /// Index of the vehicle among those that take part.
     pub(super) agent: usize,
     pub(super) capture_nanos: u64,
@@ -37,7 +37,7 @@ pub(super) struct DelayedSweep {
 /// Frames in flight to the agents.
 pub(super) struct SensorLink {
     emulator: LinkEmulator,
-    held: BTreeMap<u64, DelayedSweep>,
+    held: BTreeMap<u64, Sweep>,
     next_id: u64,
     /// By vehicle, as for its own messages: losses must not depend on the other vehicles.
     next_sequences: BTreeMap<CavId, u64>,
@@ -60,7 +60,7 @@ impl SensorLink {
     }
 
     /// Submits the current frame of a vehicle. Data of all its sensors at a tick are transmitted together.
-    pub(super) fn submit(&mut self, held: DelayedSweep, now: Instant) {
+    pub(super) fn submit(&mut self, held: Sweep, now: Instant) {
         let (cav, frame) = (&held.frame.cav, &held.frame);
         let points = frame.points.len() + frame.radar.as_ref().map_or(0, |radar| radar.len());
         let cameras = frame.cameras.iter();
@@ -93,7 +93,7 @@ impl SensorLink {
     }
 
     /// Frames that have arrived by now.
-    pub(super) fn arrived(&mut self, now: Instant) -> Vec<DelayedSweep> {
+    pub(super) fn arrived(&mut self, now: Instant) -> Vec<Sweep> {
         let mut arrived = Vec::new();
         for outcome in self.emulator.advance(nanos::between(self.began, now)) {
             let id = outcome.packet.id;
@@ -121,7 +121,7 @@ mod tests {
     use super::*;
     use link::{CapacityConfig, LatencyModel, LossModel};
 
-    fn held(cav: &CavId, tick: u64) -> DelayedSweep {
+    fn held(cav: &CavId, tick: u64) -> Sweep {
         let points = PointCloud {
             xyzi: vec![[0.0; 4]; 1000],
         };
@@ -129,7 +129,7 @@ mod tests {
             points,
             ..Frame::empty(cav.clone(), tick, Handedness::Right)
         };
-        DelayedSweep {
+        Sweep {
             agent: 0,
             capture_nanos: tick,
             frame,

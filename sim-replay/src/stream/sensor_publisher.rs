@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 use protocol::message::{AgentTruth, Payload, TrueObject};
 use protocol::{CavId, Lidar, Radar, Stream, Topic, TopicCount, Truth};
 
+use super::sensor_link::Sweep;
 use bus::{Bus, BusError, Publisher, PublisherOptions};
 use dataset::LoadOptions;
 use dataset::frame::Frame;
@@ -67,8 +68,9 @@ impl SensorPublisher {
         })
     }
 
-    /// Submits the data of one vehicle captured at `capture_nanos`.
-    pub(super) fn submit(&mut self, agent: usize, capture_nanos: u64, frame: Frame) {
+    /// Submits the data of one vehicle.
+    pub(super) fn submit(&mut self, sweep: Sweep) {
+        let (agent, capture_nanos, frame) = (sweep.agent, sweep.capture_nanos, sweep.frame);
         if let Some(gnss) = frame.gnss() {
             // The pose is sent first: it is small, and the sweep cannot be used without it.
             self.send((agent, Stream::Gnss), capture_nanos, gnss);

@@ -18,8 +18,8 @@ use protocol::{
     RunId, Stream, Topic, encode_features,
 };
 use serde::{Deserialize, Serialize};
-use sim_replay::link_node::{self, NodeOptions};
-use tests::bus::{TIMEOUT, free_port};
+use sim_replay::link_node;
+use tests::bus::{TIMEOUT, free_port, link_options};
 use zenoh::bytes::ZBytes;
 use zenoh::{Session, Wait};
 
@@ -100,7 +100,7 @@ fn between(cell: &Cell, router: &Endpoint) -> Result<Measurement> {
         ..LinkConfig::default()
     };
     let emulator = LinkEmulator::new(config, Path::new("."), 1)?;
-    let options = NodeOptions::new(cav("9"), vec![Stream::Bev]);
+    let options = link_options(cav("9"), Stream::Bev);
     let received = Topic::Received {
         ego: cav("9"),
         cav: cav("7"),

@@ -13,7 +13,7 @@ use protocol::{
     CavId, DropReason, Ledger, Limits, PointCloud, Pose, PoseEstimate, Role, Stream, Topic,
 };
 use sim_replay::link_node::{self, LinkReport, NodeOptions};
-use tests::bus::{TIMEOUT, TestRouter, next_event, wait_for};
+use tests::bus::{TIMEOUT, TestRouter, link_options, next_event, wait_for};
 
 /// Number of sweeps that are sent, and of their points: 16 kB each.
 const COUNT: u64 = 6;
@@ -43,7 +43,7 @@ struct Crossing {
 
 /// The link between agent 7 and the ego 9.
 fn options() -> NodeOptions {
-    NodeOptions::new(cav("9"), vec![Stream::Points])
+    link_options(cav("9"), Stream::Points)
 }
 
 /// Waits until a topic of the bus's process reaches a receiver.

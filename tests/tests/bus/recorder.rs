@@ -3,9 +3,8 @@
 use bus::shutdown::Stop;
 use bus::{Barrier, PublisherOptions, Route};
 use protocol::Topic;
-use recording::RecordingOptions;
-use sim_replay::recorder::{self, RecordReport, RecorderOptions};
-use tests::bus::{TIMEOUT, TestRouter};
+use sim_replay::recorder::{self, RecordReport};
+use tests::bus::{TIMEOUT, TestRouter, recorder_config};
 
 use super::sessions::gnss;
 
@@ -21,16 +20,9 @@ fn record_late_messages(out: std::path::PathBuf) -> RecordReport {
     let publisher = replay
         .publisher(topic.clone(), PublisherOptions::SENSOR.lossless(8))
         .unwrap();
-    let recording = RecordingOptions::default();
-    let options = RecorderOptions {
-        out,
-        recording,
-        without: Vec::new(),
-        keeps_running: true,
-    };
+    let config = recorder_config(&bus, out);
     std::thread::scope(|scope| {
-        let recorder =
-            scope.spawn(|| recorder::record(&bus, &options, &stop, &mut |_| {}).unwrap());
+        let recorder = scope.spawn(|| recorder::record(&bus, &config, &stop, &mut |_| {}).unwrap());
         let route = Route {
             topic,
             receiver: "recorder".parse().unwrap(),

@@ -10,7 +10,7 @@ use bus::{Bus, Event, Inbox, PublisherOptions, Subscription, bounded_queue::Pop}
 use dataset::{self, Scenario};
 use protocol::{CavId, Control, Gnss, KeyExpr, Lidar, Limits, Stream, Topic, Truth, wire};
 use sim_replay::stream::{Replay, StreamOptions, StreamReport};
-use tests::bus::{TIMEOUT, TestRouter, next_event, wait_for};
+use tests::bus::{TIMEOUT, TestRouter, next_event, stream_options, wait_for};
 use tests::scene;
 
 const AGENTS: [&str; 2] = ["10", "20"];
@@ -101,7 +101,7 @@ fn every_tick_reaches_every_agent_in_order() {
         &scenario,
         StreamOptions {
             rate: 0.0,
-            ..StreamOptions::default()
+            ..stream_options()
         },
     );
     let recorded: Vec<u64> = scenario
@@ -124,7 +124,7 @@ fn what_is_published_is_what_was_recorded() {
     scene::write(folder.path(), &AGENTS, 1);
     let (router, scenario) = (TestRouter::open(), scenario(folder.path()));
     let listener = Listener::new(&router);
-    play(&router, &scenario, StreamOptions::default());
+    play(&router, &scenario, stream_options());
     let frame = scenario
         .load(1, 0, &dataset::LoadOptions::default())
         .unwrap();
@@ -179,7 +179,7 @@ fn previews_are_published_for_viewers_only() {
         .unwrap();
     wait_for("a subscriber to previews", || preview.is_wanted());
     let _listener = Listener::new(&router);
-    play(&router, &scenario, StreamOptions::default());
+    play(&router, &scenario, stream_options());
 
     let at_once = || Some(Instant::now());
     let mut previews = 0;
@@ -239,7 +239,7 @@ fn the_pace_is_the_recorded_one_times_the_rate() {
         &scenario,
         StreamOptions {
             rate: 2.0,
-            ..StreamOptions::default()
+            ..stream_options()
         },
     );
     // Ten steps of 100 ms at twice the speed.
@@ -269,7 +269,7 @@ fn pause_step_seek_and_resume_steer_the_clock() {
         let playing = scope.spawn(|| {
             let options = StreamOptions {
                 repeats: true,
-                ..StreamOptions::default()
+                ..stream_options()
             };
             play_until(&router, &scenario, options, &stop)
         });
@@ -310,7 +310,7 @@ fn a_restarted_replay_resumes_and_does_not_wait_for_offline_agents() {
     let options = StreamOptions {
         rate: 4.0,
         checkpoint: Some(checkpoint.clone()),
-        ..StreamOptions::default()
+        ..stream_options()
     };
     let (listener, stop) = (Listener::new(&router), Stop::new());
     let next_truth = || loop {
@@ -374,7 +374,7 @@ fn an_agent_that_does_not_come_is_named() {
     let bus = router.join("replay", "replay");
     let options = StreamOptions {
         ready_timeout: Duration::from_millis(400),
-        ..StreamOptions::default()
+        ..stream_options()
     };
     let replay = Replay::prepare(&bus, &scenario, options, &Stop::new()).unwrap();
     let error = replay.wait_until_ready().unwrap_err().to_string();
@@ -398,7 +398,7 @@ fn what_the_scene_does_not_have_is_named() {
     };
     let error = refused(StreamOptions {
         agents: vec![CavId::new("30").unwrap()],
-        ..StreamOptions::default()
+        ..stream_options()
     });
     assert!(
         error.to_string().contains("no agent 30; it has 10, 20"),
@@ -406,7 +406,7 @@ fn what_the_scene_does_not_have_is_named() {
     );
     let error = refused(StreamOptions {
         seek: 2,
-        ..StreamOptions::default()
+        ..stream_options()
     });
     assert!(
         error
@@ -416,7 +416,7 @@ fn what_the_scene_does_not_have_is_named() {
     );
     let error = refused(StreamOptions {
         rate: f64::NAN,
-        ..StreamOptions::default()
+        ..stream_options()
     });
     assert_eq!(
         error.to_string(),
@@ -438,7 +438,7 @@ fn an_unreadable_frame_is_named_and_the_rest_is_replayed() {
         &scenario,
         StreamOptions {
             rate: 0.0,
-            ..StreamOptions::default()
+            ..stream_options()
         },
     );
     assert_eq!(
@@ -467,7 +467,7 @@ fn a_request_to_stop_ends_a_loop_without_end() {
     let options = StreamOptions {
         repeats: true,
         rate: 10.0,
-        ..StreamOptions::default()
+        ..stream_options()
     };
     let replay = Replay::prepare(&bus, &scenario, options, &stop).unwrap();
     replay.wait_until_ready().unwrap();

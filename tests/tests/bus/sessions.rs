@@ -6,8 +6,8 @@ use std::time::{Duration, Instant};
 
 use bus::shutdown::Stop;
 use bus::{
-    self, Barrier, Bus, BusConfig, BusError, BusOptions, Endpoint, Event, LivelinessEvent,
-    Publisher, PublisherOptions, Route, SharedMemory, SharedMemoryUse, bounded_queue::Pop,
+    self, Barrier, Bus, BusConfig, BusError, BusOptions, Endpoint, Event, Publisher,
+    PublisherOptions, Route, SharedMemory, SharedMemoryUse, bounded_queue::Pop,
 };
 use protocol::{
     Account, CavId, Control, DropReason, Gnss, GnssSource, Ledger, Lidar, Limits, PointCloud, Pose,
@@ -367,22 +367,16 @@ fn a_late_joiner_is_detected_receives_and_its_end_is_detected() {
     let early = router.join("agent-1", "1");
     let _presence = early.announce(Role::Agent).unwrap();
     let _watch = ego
-        .watch(Role::Agent, move |event| {
-            let _ = report.send(event);
+        .watch(Role::Agent, move |cav, is_there| {
+            let _ = report.send((cav, is_there));
         })
         .unwrap();
-    let seen = |event: LivelinessEvent| assert_eq!(events.recv_timeout(TIMEOUT).unwrap(), event);
-    seen(LivelinessEvent::Joined {
-        role: Role::Agent,
-        cav: cav("1"),
-    });
+    let seen = |event: (CavId, bool)| assert_eq!(events.recv_timeout(TIMEOUT).unwrap(), event);
+    seen((cav("1"), true));
 
     let late = router.join("agent-2", "2");
     let presence = late.announce(Role::Agent).unwrap();
-    seen(LivelinessEvent::Joined {
-        role: Role::Agent,
-        cav: cav("2"),
-    });
+    seen((cav("2"), true));
     let topic = topic("2/gnss");
     let inbox = ego.inbox(4, 4);
     let _subscription = ego.subscribe(topic.clone(), &inbox).unwrap();
@@ -394,16 +388,10 @@ fn a_late_joiner_is_detected_receives_and_its_end_is_detected() {
     assert!(matches!(next_event(&inbox), (found, Event::Message(_)) if found == topic));
 
     presence.withdraw().unwrap();
-    seen(LivelinessEvent::Left {
-        role: Role::Agent,
-        cav: cav("2"),
-    });
+    seen((cav("2"), false));
     // A crashed one is detected as well.
     early.session().close().wait().unwrap();
-    seen(LivelinessEvent::Left {
-        role: Role::Agent,
-        cav: cav("1"),
-    });
+    seen((cav("1"), false));
 }
 
 #[test]

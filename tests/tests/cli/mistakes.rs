@@ -15,7 +15,7 @@ type Row = (&'static str, i32, &'static str);
 const EVAL: &str = "v2vloc eval --dataset {s} --weights {w} --method max";
 
 /// Mistakes in options of an evaluation: what follows [`EVAL`].
-const OF_AN_EVALUATION: [Row; 29] = [
+const OF_AN_EVALUATION: [Row; 32] = [
     (
         "--noise-position-std-m 2",
         2,
@@ -47,6 +47,8 @@ const OF_AN_EVALUATION: [Row; 29] = [
     ("--ground-truth-range-m 1,2,3", 2, "3 numbers, expected 6"),
     ("--gate 2", 2, "codec.gate.threshold is 2: must be below"),
     ("--seed 3", 2, "--link"),
+    ("--slice 1/2", 2, "--table"),
+    ("--print slurm --slices 2", 2, "--table"),
     ("--attackers 2", 2, "--attack"),
     ("--attack noise --attackers 0", 2, "attackers is 0"),
     (
@@ -83,6 +85,7 @@ const OF_AN_EVALUATION: [Row; 29] = [
     ("--method late --dtype f16", 2, "late sends none"),
     ("--method none --trust", 2, "none uses none"),
     ("--method maxx", 2, "maxx"),
+    ("--method late,max", 2, "--method names max twice"),
     ("--method script:{d}/none.pt", 2, "none.pt: No such file"),
     (
         "--weights {d}/none.safetensors",
@@ -91,7 +94,7 @@ const OF_AN_EVALUATION: [Row; 29] = [
     ),
 ];
 
-const MISTAKES: [Row; 37] = [
+const MISTAKES: [Row; 51] = [
     (
         "v2vloc eval --dataset {d}/none --weights {w} --method max",
         2,
@@ -116,6 +119,11 @@ const MISTAKES: [Row; 37] = [
         "v2vloc eval --table {d}/experiment.yaml --out {d}/tables --dtype f16",
         2,
         "cannot be used with",
+    ),
+    (
+        "v2vloc eval --table {d}/experiment.yaml --out {d}/tables --attackers 2",
+        2,
+        "--attack",
     ),
     (
         "v2vloc eval --table {d}/experiment.yaml --out {d}/tables",
@@ -159,6 +167,11 @@ const MISTAKES: [Row; 37] = [
         2,
         "cannot be used with",
     ),
+    (
+        "v2vloc sweep {d}/experiment.yaml --slice 1/2 --slices 3",
+        2,
+        "--print <ENGINE>",
+    ),
     ("v2vloc demo --vehicles 9", 2, "9 is not in 2..=4"),
     (
         "v2vloc view nosuchrun --runs {d}",
@@ -176,6 +189,8 @@ const MISTAKES: [Row; 37] = [
         2,
         "--runs",
     ),
+    ("v2vloc status x --keys {d}", 2, "--connect"),
+    ("v2vloc view x --run y", 2, "--connect"),
     (
         "v2vloc router --listen tcp/127.0.0.1:{p}",
         2,
@@ -214,11 +229,56 @@ const MISTAKES: [Row; 37] = [
     ),
     ("sim-replay link --print nolink", 2, "nolink"),
     (
+        "sim-replay link --print {d}/experiment.yaml",
+        2,
+        "this is an experiment: v2vloc sweep FILE",
+    ),
+    (
         "agent locate {d}/none.pcd --head town9",
         2,
         "town9: no such file or released head",
     ),
+    (
+        "agent locate {d}/none.pcd --head {w}/surfels-town1.safetensors --encoder {w}/pgc-encoder.safetensors",
+        2,
+        "a surfel map has no encoder",
+    ),
+    (
+        "agent eval --dataset {s} --head {w}/surfels-town1.safetensors --seed 4",
+        2,
+        "--seed need a head",
+    ),
     ("agent eval --dataset {s} --measure-every 2", 2, "--tracked"),
+    (
+        "agent eval --dataset {s} --icp-map {s} --measure-every 2",
+        2,
+        "--tracked",
+    ),
+    (
+        "agent eval --dataset {s} --tracked --by scan-context",
+        2,
+        "--retrieval",
+    ),
+    (
+        "agent eval --dataset {s} --head town1 --map-spacing-m 3",
+        2,
+        "--icp-map",
+    ),
+    (
+        "agent eval --dataset {s} --tracked --good-loss 0.3",
+        2,
+        "--fit-confidence",
+    ),
+    (
+        "agent eval --dataset {s} --surfel-map town1 --good-loss 0.3",
+        2,
+        "--fit-confidence",
+    ),
+    (
+        "agent eval --dataset {s} --max-wrong 0.001",
+        2,
+        "--fit-covariance",
+    ),
     (
         "agent eval --dataset {s} --solver sc2pcr --seed 3",
         2,
@@ -238,6 +298,11 @@ const MISTAKES: [Row; 37] = [
         "ego-fuser eval --dataset {s} --weights {w}",
         2,
         "a folder, must be one",
+    ),
+    (
+        "ego-fuser train --dataset {s} --network lean --freeze-encoder --steps 1 --out {d}/new",
+        2,
+        "--init",
     ),
     (
         "ego-fuser train --dataset {s} --method max --noise-share 0.5 --steps 1 --out {d}/new",

@@ -5,9 +5,10 @@ use std::process::Command;
 use std::sync::Arc;
 
 use agent_offline::icp_map::{IcpMapPose, read_map};
+use dataset::frame::Frame;
 use dataset::pcd;
 use dataset::{self, LeftOut, LoadOptions};
-use ego_fuser_offline::alignment::{AlignmentSpec, BoxIcp, CloudIcp, FreeAlign, GivenPose, Poses};
+use ego_fuser_offline::alignment::{AlignmentSpec, BoxIcp, CloudIcp, FreeAlign, Poses};
 use ego_fuser_offline::evaluation::alignment::table::PairTally;
 use ego_fuser_offline::evaluation::alignment::{self, BoxSource, PairOutcome};
 use localization::pose_source::{PoseSource, RecordedPose};
@@ -150,9 +151,15 @@ fn approaches_meet_on_generated_scenes() {
     assert!(map.planes() > 1000);
     let source = IcpMapPose::new(map, config);
     let methods = [
-        Poses::spec("true", GivenPose::True, || Ok(Box::new(RecordedPose))),
-        Poses::spec("gnss", GivenPose::Gnss, || Ok(Box::new(RecordedPose))),
-        Poses::spec("icp-map", GivenPose::Gnss, move || {
+        Poses::spec(
+            "true",
+            |frame| frame.world_from_lidar,
+            || Ok(Box::new(RecordedPose)),
+        ),
+        Poses::spec("gnss", Frame::gnss_world_from_lidar, || {
+            Ok(Box::new(RecordedPose))
+        }),
+        Poses::spec("icp-map", Frame::gnss_world_from_lidar, move || {
             Ok(Box::new(source.clone()) as Box<dyn PoseSource>)
         }),
         CloudIcp::spec(false),

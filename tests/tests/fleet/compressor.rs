@@ -23,7 +23,7 @@ use protocol::{
 };
 use sim_replay::stream::{Replay, StreamOptions};
 use tch::Device;
-use tests::bus::{TIMEOUT, TestRouter, ego_options};
+use tests::bus::{TIMEOUT, TestRouter, ego_options, stream_options};
 use tests::{networks, scene};
 
 const AGENTS: [&str; 2] = ["10", "20"];
@@ -141,7 +141,7 @@ fn live(folder: &Path, weights: &Path, of_neighbour: &Path) -> (Vec<Detections>,
                 .collect(),
             lockstep: vec![cav("10")],
             agents: AGENTS.map(cav).into(),
-            ..StreamOptions::default()
+            ..stream_options()
         };
         let playing = Replay::prepare(&replay, &scenario, options, &Stop::new()).unwrap();
         playing.wait_until_ready().unwrap();

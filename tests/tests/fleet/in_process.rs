@@ -25,11 +25,13 @@ use protocol::{
     Account, CavId, DecodedFeatures, Detection, Detections, DropReason, Ledger, Limits, RateReason,
     Stream, Topic,
 };
-use recording::{Recording, RecordingOptions};
-use sim_replay::recorder::{self, RecordReport, RecorderOptions};
+use recording::Recording;
+use sim_replay::recorder::{self, RecordReport};
 use sim_replay::stream::{Replay, StreamOptions};
 use tch::Device;
-use tests::bus::{TIMEOUT, TestRouter, ego_options, next_event, wait_for};
+use tests::bus::{
+    TIMEOUT, TestRouter, ego_options, next_event, recorder_config, stream_options, wait_for,
+};
 use tests::{networks, scene};
 use zenoh::Wait;
 
@@ -162,14 +164,8 @@ fn record<'scope>(
     let (out, stop) = (file.to_path_buf(), stop.clone());
     scope.spawn(move || {
         let bus = router.join("recorder", "recorder");
-        let recording = RecordingOptions::default();
-        let options = RecorderOptions {
-            out,
-            recording,
-            without: Vec::new(),
-            keeps_running: true,
-        };
-        let report = recorder::record(&bus, &options, &stop, &mut |_| {}).unwrap();
+        let config = recorder_config(&bus, out);
+        let report = recorder::record(&bus, &config, &stop, &mut |_| {}).unwrap();
         bus.leave(TIMEOUT).unwrap();
         report
     })
@@ -230,7 +226,7 @@ fn play_and_record(
                 .iter()
                 .map(|cav_id| cav(cav_id))
                 .collect(),
-            ..StreamOptions::default()
+            ..stream_options()
         };
         let playing = Replay::prepare(&replay, &scenario, options, &ending).unwrap();
         playing.wait_until_ready().unwrap();

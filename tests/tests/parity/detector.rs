@@ -50,7 +50,7 @@ fn golden_c1_pointpillar() {
 
     // The detector's own pillar encoder works without tensors, sweep by sweep.
     let projection = PillarProjection::new(&case.encoder);
-    let size = case.pillar_grid.width * case.pillar_grid.height * projection.channels();
+    let size = case.pillar_grid.width * case.pillar_grid.height * projection.channels;
     let mut canvases = vec![0.0; case.sweeps.len() * size];
     for (pillars, canvas) in case.sweeps.iter().zip(canvases.chunks_exact_mut(size)) {
         projection.scatter(pillars, &case.pillar_grid, canvas);

@@ -1,11 +1,12 @@
 //! Training targets, loss, AP, warps and fusion against the reference implementations.
 
-use ::training::loss::{LabelTensors, LossConfig, Unassigned, detection_loss};
+use ::training::loss::{self, LabelTensors, Unassigned, detection_loss};
 use dataset::average_precision::{Ordering, PrecisionRecallCurve, Scorer};
 use dataset::ground_truth::GroundTruth;
 use fusion::targets::{BOX_CODE, Labels, NEGATIVE_IOU, POSITIVE_IOU, Positive, TargetAssigner};
 use fusion::warp::{coalign, warp_to_ego};
 use fusion::{AlignedMaps, AttentionFusion, Fusion, MapMetadata, MaxFusion};
+use perception::boxes::anchors::Anchors;
 use protocol::{BevGrid, Box3d, Detection, Pose};
 use tch::{Device, Kind, Tensor};
 use tests::fixtures::{Golden, assert_close, golden};
@@ -22,8 +23,21 @@ fn golden_c3_targets() {
     let thresholds = ["pos_threshold", "neg_threshold"].map(threshold);
     assert_eq!(thresholds, [POSITIVE_IOU, NEGATIVE_IOU]);
     assert_eq!(config["order"], "hwl");
-    let anchors: Vec<Box3d> = anchors.as_chunks().0.iter().map(box_of_hwl).collect();
-    let assigner = TargetAssigner::new(anchors, [shape[0], shape[1], shape[2]]).unwrap();
+    let boxes: Vec<Box3d> = anchors.as_chunks().0.iter().map(box_of_hwl).collect();
+    let (width, per_cell) = (shape[1], shape[2]);
+    let anchors = Anchors {
+        x_m: (0..width)
+            .map(|column| boxes[column * per_cell].center_m[0])
+            .collect(),
+        y_m: (0..shape[0])
+            .map(|row| boxes[row * width * per_cell].center_m[1])
+            .collect(),
+        z_m: boxes[0].center_m[2],
+        size_lwh_m: boxes[0].size_m,
+        yaws_rad: boxes[..per_cell].iter().map(|it| it.heading_rad).collect(),
+    };
+    assert!((0..boxes.len()).all(|index| anchors.box_at(index) == boxes[index]));
+    let assigner = TargetAssigner::new(anchors);
     let objects: Vec<Box3d> = objects
         .as_chunks()
         .0
@@ -98,7 +112,7 @@ fn golden_c4_average_precision() {
             .collect();
         scorer.add(&found, &GroundTruth::of_boxes(boxes("gt_corners")));
     }
-    for (tally, threshold) in scorer.tallies().iter().zip(&thresholds) {
+    for (tally, threshold) in scorer.tallies.iter().zip(&thresholds) {
         let prefix = format!("out.{:02.0}", threshold * 100.0);
         let lists = |pick: fn(bool) -> bool| -> Vec<i64> {
             tally
@@ -426,17 +440,20 @@ fn golden_c7_loss() {
         .zip(targets.chunks(anchors * BOX_CODE))
         .map(|(positive, targets)| labels_of_dense(positive, targets))
         .collect();
-    let config = LossConfig {
-        alpha: number(&golden, "alpha"),
-        gamma: number(&golden, "gamma"),
-        beta: number(&golden, "beta"),
-        score_weight: number(&golden, "cls_weight"),
-        box_weight: number(&golden, "reg"),
-        unassigned: Unassigned::Background,
-        ..LossConfig::default()
-    };
-    let labels = LabelTensors::gather(&labels, config.unassigned, Device::Cpu);
-    let loss = detection_loss(&scores, &boxes, &labels, &config).unwrap();
+    let constants =
+        ["alpha", "gamma", "beta", "cls_weight", "reg"].map(|name| number(&golden, name));
+    assert_eq!(
+        constants,
+        [
+            loss::ALPHA,
+            loss::GAMMA,
+            loss::BETA,
+            loss::SCORE_WEIGHT,
+            loss::BOX_WEIGHT
+        ]
+    );
+    let labels = LabelTensors::gather(&labels, Unassigned::Background, Device::Cpu);
+    let loss = detection_loss(&scores, &boxes, &labels).unwrap();
     assert_close(
         "conf",
         &values(&loss.score),

@@ -384,7 +384,7 @@ fn interrupted_trainings_resume_and_refuse_foreign_files() {
     assert!(
         matches!(
             error,
-            Error::Training(TrainingError::OtherTraining { field: "seed", .. })
+            Error::Training(TrainingError::OtherTraining("seed", ..))
         ),
         "{error}"
     );

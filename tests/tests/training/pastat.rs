@@ -20,7 +20,7 @@ use perception::inference::Inference;
 use perception::weights::Weights;
 use protocol::{Dtype, NoPoseReason, PoseEstimate};
 use runner::experiment::spec::Experiment;
-use runner::experiment::table::{self, TableObserver};
+use runner::experiment::table;
 use support::file_digests::FileDigests;
 use tests::locks::random_generator_lock;
 use tests::scene;
@@ -225,6 +225,7 @@ fn kept_maps_are_bounded_and_survive_a_cut() {
     let (whole, encoded) = open(u64::MAX);
     assert_eq!(encoded, AGENTS.len() * TICKS - 1);
     let kept = whole.map(0, 2, 3).unwrap().unwrap();
+    let first_map = whole.map(0, 0, 0).unwrap().unwrap();
     assert!(kept.allclose(&live, 1e-3, 1e-3, false));
     let file = fs::read_dir(folder.path().join("maps"))
         .unwrap()
@@ -257,8 +258,44 @@ fn kept_maps_are_bounded_and_survive_a_cut() {
     let first = 1 + u32::from_le_bytes(*bytes.first_chunk().unwrap()) as usize;
     bytes[first] ^= 0x55;
     fs::write(&file, bytes).unwrap();
-    let message = open(u64::MAX).0.map(0, 0, 0).unwrap_err().to_string();
-    assert!(message.contains(".maps"), "{message}");
+    // What is damaged or in the place of another is computed again where it is needed.
+    let (damaged, encoded) = open(u64::MAX);
+    assert!(encoded == 0 && damaged.map(0, 0, 0).unwrap().is_none());
+    assert!(damaged.map(0, 0, 1).unwrap().is_some());
+    let mut maps = MapSource::new(damaged.into(), Arc::clone(&weights));
+    let again = maps.map(0, &scenarios[0], 0, 0).unwrap();
+    assert!(again.allclose(&first_map, 1e-3, 1e-3, false));
+}
+
+#[test]
+fn kept_maps_that_changed_places_are_not_taken_for_each_other() {
+    let _generator = random_generator_lock();
+    let folder = tempfile::tempdir().unwrap();
+    let (data, init) = begin(folder.path());
+    let weights = Arc::new(Weights::load(&init).unwrap());
+    let scenarios = dataset::open(&data).unwrap().scenarios;
+    let open = || {
+        let kept = KeptMaps {
+            folder: folder.path().join("maps"),
+            dtype: Dtype::F16,
+            limit_bytes: u64::MAX,
+            intensity_scale: IntensityScale::AUTO,
+        };
+        let digests = FileDigests::default();
+        FeatureStore::open(&kept, &weights, &scenarios, &digests, 2, &mut |_, _| {}).unwrap()
+    };
+    assert!(open().map(0, 0, 0).unwrap().is_some());
+    let maps = fs::read_dir(folder.path().join("maps"));
+    let file = maps.unwrap().next().unwrap().unwrap().path();
+    let bytes = fs::read(&file).unwrap();
+    let length = |at: usize| 4 + u32::from_le_bytes(*bytes[at..].first_chunk().unwrap()) as usize;
+    let second = length(0);
+    let third = second + length(second);
+    let exchanged = [&bytes[second..third], &bytes[..second], &bytes[third..]];
+    fs::write(&file, exchanged.concat()).unwrap();
+    let store = open();
+    let is_kept = [0, 1, 2].map(|tick| store.map(0, 0, tick).unwrap().is_some());
+    assert_eq!(is_kept, [false, false, true]);
 }
 
 #[test]
@@ -366,23 +403,6 @@ fn poses_that_were_found_once_serve_training_and_evaluation() {
     );
 }
 
-#[derive(Default)]
-struct Cells {
-    known: usize,
-    computed: usize,
-}
-
-impl TableObserver for Cells {
-    fn cell(&mut self, _: &str, _: &str, _: &str, known: bool) {
-        if known {
-            self.known += 1
-        } else {
-            self.computed += 1
-        }
-    }
-    fn frame(&mut self) {}
-}
-
 #[test]
 fn an_interrupted_table_resumes_at_the_next_cell() {
     let _generator = random_generator_lock();
@@ -400,22 +420,30 @@ fn an_interrupted_table_resumes_at_the_next_cell() {
         Experiment::read(&file).unwrap()
     };
     let out = folder.path().join("out");
-    let mut first = Cells::default();
-    table::run(&spec(""), &out, None, &mut first).unwrap();
-    assert_eq!((first.known, first.computed), (0, 2));
-    // The same file twice is refused; a copy is another training with the same contents.
+    // Fills the tables, and counts the cells that were known and those that were computed.
+    let run = |spec: &Experiment| {
+        let (mut known_cells, mut computed) = (0, 0);
+        let mut on_cell = |_: &str, known: bool| match known {
+            true => known_cells += 1,
+            false => computed += 1,
+        };
+        let filled = table::run(spec, &out, None, &mut on_cell, &mut || {})?;
+        anyhow::Ok((filled, (known_cells, computed)))
+    };
+    assert_eq!(run(&spec("")).unwrap().1, (0, 2));
+    // A copy is the same training, whatever its name.
     let copy = folder.path().join("copy.safetensors");
     fs::copy(&init, &copy).unwrap();
-    let row = format!(
-        "  - {{name: best, method: late, weights: [{}, {}]}}\n",
-        init.display(),
-        copy.display()
-    );
-    let mut second = Cells::default();
-    let filled = table::run(&spec(&row), &out, None, &mut second).unwrap();
-    // The second training has the contents of the first: its cells are those of the first.
-    assert_eq!((second.known, second.computed), (4, 2));
-    assert_eq!(filled[0].rows[1].cells[0].len(), 2);
+    let row = |files: &str| format!("  - {{name: best, method: late, weights: [{files}]}}\n");
+    let (one, other) = (init.display(), copy.display());
+    let twice = spec(&row(&format!("{one}, {other}")));
+    let refused = run(&twice).unwrap_err();
+    let expected =
+        format!("table \"noise\", row best: weights {one} and {other} have the same contents");
+    assert_eq!(refused.to_string(), expected);
+    let (filled, second) = run(&spec(&row(&other.to_string()))).unwrap();
+    assert_eq!(second, (2, 2));
+    assert_eq!(filled[0].rows[1].1[0].len(), 1);
     let text = fs::read_to_string(out.join("noise.md")).unwrap();
     assert!(
         text.contains("| best |") && text.contains("1 m") && text.contains("Frames: 3."),
@@ -426,6 +454,6 @@ fn an_interrupted_table_resumes_at_the_next_cell() {
             .unwrap()
             .lines()
             .count(),
-        1 + 2 + 4
+        1 + 2 + 2
     );
 }

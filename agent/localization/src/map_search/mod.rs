@@ -44,15 +44,6 @@ const RIVAL_SCORE: f64 = 0.85;
 const MIN_AGREEMENT: f64 = 0.35;
 const MIN_MARGIN: f64 = 0.1;
 
-/// Result of a search.
-struct BestPose {
-    fit: IcpFit,
-    /// Share of the sweep's planes that agree with the map.
-    agreement: f64,
-    /// False if another pose fits nearly as well, or the search was cut short.
-    is_unique: bool,
-}
-
 /// Global localization in a surfel map.
 #[derive(Debug)]
 pub struct MapSearch {
@@ -85,8 +76,10 @@ impl MapSearch {
         }))
     }
 
-    /// The registered pose with the largest agreement; `None` where no candidate can be registered.
-    fn best_pose(&self, sweep: &SweepOnMap<'_>) -> Option<BestPose> {
+    /// The registered pose with the largest agreement, the share of the sweep's planes that agree with the map; and
+    /// whether it is unique: false if another pose fits nearly as well, or the search was cut short. `None` where no
+    /// candidate can be registered.
+    fn best_pose(&self, sweep: &SweepOnMap<'_>) -> Option<(IcpFit, f64, bool)> {
         let (ground, _) = sweep.level_planes();
         let below = LevelSums::of(&ground);
         let levelled = below.levelled();
@@ -116,11 +109,7 @@ impl MapSearch {
         let rival = others.map(|(_, agreed)| *agreed).fold(0.0, f64::max);
         // A search that was cut short may have missed a better pose.
         let is_unique = agreement - rival >= MIN_MARGIN && !search.is_exhausted();
-        Some(BestPose {
-            fit,
-            agreement,
-            is_unique,
-        })
+        Some((fit, agreement, is_unique))
     }
 
     /// A pose in the plane as one in the world, on the ground there; `None` where the map has no ground.
@@ -180,15 +169,15 @@ impl Localize for MapSearch {
         }
         let best = self.best_pose(&on_map);
         times.lap(SOLVE);
-        let Some(best) = best else {
+        let Some((fit, agreement, is_unique)) = best else {
             return Ok(Localization::no_pose(NoPoseReason::TooFewInliers, times));
         };
-        let mut found = found_pose(&best.fit, self.map.covariance_scale);
-        found.evidence.inlier_ratio = best.agreement;
-        let is_confirmed = best.agreement >= MIN_AGREEMENT
+        let mut found = found_pose(&fit, self.map.covariance_scale);
+        found.evidence.inlier_ratio = agreement;
+        let is_confirmed = agreement >= MIN_AGREEMENT
             && on_map.stands_on(&self.map, &found.world_from_sensor)
-            && on_map.confirms(&self.map, &best.fit);
-        found.is_rejected = !is_confirmed || !best.is_unique || found.sigma < self.min_confidence;
+            && on_map.confirms(&self.map, &fit);
+        found.is_rejected = !is_confirmed || !is_unique || found.sigma < self.min_confidence;
         Ok(Localization::new(&Ok(found), times))
     }
 

@@ -24,14 +24,8 @@ pub enum LocalizerError {
     Config(String),
     /// The detector whose encoder is used failed.
     #[error(transparent)]
-    Detector(Box<DetectorError>),
+    Detector(#[from] DetectorError),
     /// The tensor library failed.
     #[error("tensor library: {}", first_line(.0))]
     Tensor(#[from] TchError),
-}
-
-impl From<DetectorError> for LocalizerError {
-    fn from(error: DetectorError) -> Self {
-        Self::Detector(Box::new(error))
-    }
 }

@@ -70,15 +70,9 @@ fn released_file(head: &Path, kind: &str, prefix: &str, trained: &str) -> Result
     })
 }
 
-/// The encoder of a head, scene encoder or detector: the file whose digest its metadata names, of those beside it or
-/// released; without one `pgc-encoder.safetensors` beside it. Empty for a surfel map in place of a head, which has none.
-///
-/// # Errors
-/// [`FileError`] when there is none, or the head cannot be read.
-pub fn encoder_of(head: &Path) -> Result<PathBuf> {
-    if SurfelMap::is_in(head) {
-        return Ok(PathBuf::new());
-    }
+/// The file whose digest the metadata of a head names, of those beside it or released; without one
+/// `pgc-encoder.safetensors` beside it.
+fn encoder_of(head: &Path) -> Result<PathBuf> {
     let beside = Some(head.with_file_name(ENCODER_FILE)).filter(|file| file.is_file());
     match (named_encoder(head), beside) {
         (Ok(Ok(found)), _) => Ok(found),
@@ -94,12 +88,23 @@ pub fn encoder_of(head: &Path) -> Result<PathBuf> {
     }
 }
 
-/// The encoder that is given, or else that of the head.
+/// The encoder that is given, or else that of the head, scene encoder or detector: the file whose digest its metadata
+/// names, of those beside it or released; without one `pgc-encoder.safetensors` beside it. Empty for a surfel map in place
+/// of a head, which has none.
 ///
 /// # Errors
-/// As [`encoder_of`].
+/// [`FileError`] when there is none, the head cannot be read, or one is given with a surfel map.
 pub fn encoder_or_named(encoder: Option<&Path>, head: &Path) -> Result<PathBuf> {
-    encoder.map_or_else(|| encoder_of(head), |given| Ok(given.to_owned()))
+    match (encoder, SurfelMap::is_in(head)) {
+        (None, true) => Ok(PathBuf::new()),
+        (None, false) => encoder_of(head),
+        (Some(given), false) => Ok(given.to_owned()),
+        (Some(given), true) => {
+            let given = given.display();
+            let problem = format_args!("a surfel map has no encoder, but {given} is given");
+            Err(FileError::new(head, problem))
+        }
+    }
 }
 
 /// True for a word that may name a released head: a single component without an ending.
@@ -164,7 +169,26 @@ fn files_in(folder: &Path) -> Vec<PathBuf> {
 
 #[cfg(test)]
 mod tests {
+    use perception::weights::{KIND_KEY, Precision, save};
+    use tch::Device;
+    use tch::nn::VarStore;
+
     use super::*;
+
+    #[test]
+    fn a_surfel_map_in_place_of_a_head_takes_no_encoder() {
+        let folder = tempfile::tempdir().unwrap();
+        let map = folder.path().join(SURFELS_FILE);
+        let about = [(KIND_KEY.to_owned(), "surfel_map".to_owned())].into();
+        let nothing = VarStore::new(Device::Cpu);
+        save(&map, &nothing, &about, Precision::Single).unwrap();
+        assert_eq!(encoder_or_named(None, &map).unwrap(), Path::new(""));
+        let given = Some(Path::new("e.safetensors"));
+        let message = encoder_or_named(given, &map).unwrap_err().to_string();
+        for file in [SURFELS_FILE, "e.safetensors"] {
+            assert!(message.contains(file), "{message}");
+        }
+    }
 
     #[test]
     fn a_head_is_a_file_or_the_folder_of_a_training() {

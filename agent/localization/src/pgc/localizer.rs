@@ -92,12 +92,13 @@ impl Localizer {
         }
         let (mut network, encoder_sha256) = CellEncoder::load(encoder, device)?;
         let weights = Weights::load(head)?.with_precision(precision);
-        let mut scene_head =
-            weights.network(SceneHead::KIND, device, |path, config: SceneHeadConfig| {
-                // Before the layers are built: a wrong encoder is named as such, not by a shape.
-                config.check_encoder(head, encoder, &encoder_sha256)?;
-                SceneHead::new(path, &config)
-            })?;
+        weights.check_kind(SceneHead::KIND)?;
+        let config: SceneHeadConfig = weights.config()?;
+        // Before the layers are built: a wrong encoder is named as such, not by a shape.
+        config.check_encoder(head, encoder, &encoder_sha256)?;
+        let mut scene_head = weights.network(SceneHead::KIND, device, |path, config| {
+            SceneHead::new(path, &config)
+        })?;
         // The head's file has the scales of both networks.
         if let Some(scales) = weights.activation_scales()? {
             let quantised = network

@@ -101,11 +101,9 @@ impl PoseSolver {
     ) -> Result<Registration, NoRegistration> {
         let pairs = coordinates.correspondences();
         if pairs.len() < MIN_CELLS {
-            return Err(NoRegistration::TooFewCorrespondences {
-                usable: pairs.len(),
-                given: pairs.len(),
-                required: MIN_CELLS,
-            });
+            let (usable, given) = (pairs.len(), pairs.len());
+            let none = NoRegistration::TooFewCorrespondences(usable, given, MIN_CELLS);
+            return Err(none);
         }
         let found = match &self.solver {
             Solver::Ransac(config) => ransac::solve(&pairs, &config.wider(factor))?,
@@ -184,7 +182,7 @@ pub fn estimate(solved: &Solved) -> PoseEstimate {
     let (reason, inliers) = match solved {
         Ok(found) if found.is_rejected => (NoPoseReason::LowConfidence, found.evidence.inliers),
         Ok(found) => return PoseEstimate::new(found.world_from_sensor.into(), found.sigma as f32),
-        Err(error @ NoRegistration::TooFewCorrespondences { .. }) => {
+        Err(error @ NoRegistration::TooFewCorrespondences(..)) => {
             (NoPoseReason::TooFewPoints, error.inlier_count())
         }
         Err(error) => (NoPoseReason::TooFewInliers, error.inlier_count()),

@@ -15,19 +15,9 @@ const MAX_ERROR_M: f64 = 1e5;
 /// Largest file that is read, bytes.
 const MAX_BYTES: u64 = 64 << 20;
 
-/// Result of one sweep.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub enum TableRow {
-    /// A pose with this error, in the vehicle's frame (x forward, y left).
-    Pose {
-        /// Error in position and heading.
-        error: PlanarError,
-        /// Confidence of the generator, 0..=1.
-        confidence: f32,
-    },
-    /// No pose.
-    NoPose,
-}
+/// Result of one sweep: error of its pose in position and heading, in the vehicle's frame (x forward, y left), and
+/// confidence of the generator, 0..=1; `None`: no pose.
+pub type TableRow = Option<(PlanarError, f32)>;
 
 /// Rows in the order of the sweeps they were measured on.
 ///
@@ -62,7 +52,7 @@ impl ErrorTable {
 fn parse_row(row: CsvRow<'_>) -> Result<TableRow, FileError> {
     // Such a line has one field only: it is read before the number of fields is checked.
     if row.field(0) == "no_pose" {
-        return Ok(TableRow::NoPose);
+        return Ok(None);
     }
     let row = row.complete()?;
     let mut position_m = [0.0; 3];
@@ -70,13 +60,13 @@ fn parse_row(row: CsvRow<'_>) -> Result<TableRow, FileError> {
         *metres = row.number(column, -MAX_ERROR_M..=MAX_ERROR_M, "metres within 100 km")?;
     }
     let yaw_deg = row.number(3, -360.0..=360.0, "degrees within a turn")?;
-    Ok(TableRow::Pose {
-        error: PlanarError {
-            position_m,
-            yaw_rad: yaw_deg.to_radians(),
-        },
-        confidence: row.number(4, 0.0..=1.0, "0 to 1")? as f32,
-    })
+    let yaw_rad = yaw_deg.to_radians();
+    let confidence = row.number(4, 0.0..=1.0, "0 to 1")? as f32;
+    let error = PlanarError {
+        position_m,
+        yaw_rad,
+    };
+    Ok(Some((error, confidence)))
 }
 
 #[cfg(test)]
@@ -93,11 +83,11 @@ mod tests {
     #[test]
     fn rows_repeat_after_the_last() {
         let table = read("x_m,y_m,z_m,yaw_deg,confidence\n0.1,0,0,180,0.5\nno_pose\n\n").unwrap();
-        let TableRow::Pose { error, confidence } = table.row(1, 1) else {
+        let Some((error, confidence)) = table.row(1, 1) else {
             panic!("{table:?}")
         };
         assert!((error.yaw_rad - std::f64::consts::PI).abs() < 1e-12 && confidence == 0.5);
-        assert_eq!(table.row(0, 1), TableRow::NoPose);
+        assert_eq!(table.row(0, 1), None);
         assert_eq!(table.row(u64::MAX, u64::MAX), table.row(0, 0));
     }
 

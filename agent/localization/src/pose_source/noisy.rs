@@ -10,7 +10,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use support::random::scenario_seed;
 
-use super::error_table::{ErrorTable, TableRow};
+use super::error_table::ErrorTable;
 use super::noise;
 use super::settings::{PoseBasis, PoseSettings};
 use super::{NO_SOURCE, PoseInput, PoseSource, PoseSourceError, no_pose};
@@ -194,10 +194,10 @@ impl NoisyPose {
             let key = noise::key(self.config.seed, cav);
             let first_row = u64::from_le_bytes(std::array::from_fn(|byte| key[byte]));
             return match table.row(first_row, step) {
-                TableRow::Pose { error, confidence } => {
+                Some((error, confidence)) => {
                     PoseEstimate::new(error.added_in_vehicle(pose), confidence)
                 }
-                TableRow::NoPose => no_pose(NoPoseReason::TooFewInliers),
+                None => no_pose(NoPoseReason::TooFewInliers),
             };
         }
         let error = match self.config.mode {

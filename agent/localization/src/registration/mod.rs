@@ -100,59 +100,34 @@ impl Registration {
 
     /// Itself if there are at least `required` inliers.
     fn with_at_least(self, required: usize, given: usize) -> Result<Self, NoRegistration> {
-        if self.inliers.len() < required {
-            return Err(NoRegistration::TooFewInliers {
-                found: self.inliers.len(),
-                required,
-                given,
-            });
+        match self.inliers.len() {
+            found if found < required => Err(NoRegistration::TooFewInliers(found, given, required)),
+            _ => Ok(self),
         }
-        Ok(self)
     }
 }
 
 /// Reason why correspondences give no motion.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum NoRegistration {
-    /// There is too little to start from.
-    #[error("{usable} of {given} correspondences are usable, at least {required} are needed")]
-    TooFewCorrespondences {
-        /// Number with finite coordinates and a positive weight.
-        usable: usize,
-        /// Number of all correspondences.
-        given: usize,
-        /// Number required.
-        required: usize,
-    },
-    /// Too few are inliers of any motion.
-    #[error(
-        "at most {found} of {given} correspondences agree on one motion, at least {required} must"
-    )]
-    TooFewInliers {
-        /// Largest number of inliers.
-        found: usize,
-        /// Number required.
-        required: usize,
-        /// Number of all correspondences.
-        given: usize,
-    },
-    /// The inliers do not constrain the motion.
-    #[error("{inliers} inliers do not constrain a motion: {reason}")]
-    Degenerate {
-        /// Number of inliers.
-        inliers: usize,
-        /// Reason of the fit.
-        reason: Degenerate,
-    },
+    /// There is too little to start from: number with finite coordinates and a positive weight, number of all
+    /// correspondences, number required.
+    #[error("{0} of {1} correspondences are usable, at least {2} are needed")]
+    TooFewCorrespondences(usize, usize, usize),
+    /// Too few are inliers of any motion: largest number of inliers, number of all correspondences, number required.
+    #[error("at most {0} of {1} correspondences agree on one motion, at least {2} must")]
+    TooFewInliers(usize, usize, usize),
+    /// The inliers do not constrain the motion: their number, and the reason of the fit.
+    #[error("{0} inliers do not constrain a motion: {1}")]
+    Degenerate(usize, Degenerate),
 }
 
 impl NoRegistration {
     /// The largest number of inliers.
     pub fn inlier_count(&self) -> usize {
         match self {
-            Self::TooFewCorrespondences { .. } => 0,
-            Self::TooFewInliers { found, .. } => *found,
-            Self::Degenerate { inliers, .. } => *inliers,
+            Self::TooFewCorrespondences(..) => 0,
+            Self::TooFewInliers(inliers, ..) | Self::Degenerate(inliers, _) => *inliers,
         }
     }
 }
@@ -161,11 +136,8 @@ impl NoRegistration {
 fn check_enough(pairs: &[Correspondence], required: usize) -> Result<(), NoRegistration> {
     let usable = pairs.iter().filter(|pair| pair.usable()).count();
     if usable < required {
-        return Err(NoRegistration::TooFewCorrespondences {
-            usable,
-            given: pairs.len(),
-            required,
-        });
+        let none = NoRegistration::TooFewCorrespondences(usable, pairs.len(), required);
+        return Err(none);
     }
     Ok(())
 }

@@ -82,7 +82,7 @@ impl PairColumns {
 
     /// Source, target and weight of the pairs within `radius_m` of their positions under `motion`.
     pub(super) fn near(&self, motion: &Isometry3<f64>, radius_m: f64) -> Vec<WeightedPair> {
-        let model = Model::new(motion);
+        let model = model_of(motion);
         let limit = (radius_m * radius_m) as f32;
         let mut near = Vec::with_capacity(self.count);
         for block in 0..self.weight.len() {
@@ -106,7 +106,7 @@ impl PairColumns {
         threshold_m: f64,
         best: &Gain,
     ) -> Option<Gain> {
-        let model = Model::new(motion);
+        let model = model_of(motion);
         let scale = (1.0 / (threshold_m * threshold_m)) as f32;
         let blocks = self.weight.len();
         let prefix = self.block_gain(&model, scale, 0..PREFIX_BLOCKS.min(blocks));
@@ -136,12 +136,12 @@ impl PairColumns {
     }
 
     #[inline]
-    fn squared_residuals(&self, model: &Model, block: usize) -> [f32; LANES] {
+    fn squared_residuals(&self, (rotation, translation): &Model, block: usize) -> [f32; LANES] {
         let [x, y, z] = self.source.each_ref().map(|column| &column[block]);
         let mut squared = [0.0; LANES];
         for (axis, target) in self.target.iter().enumerate() {
-            let [a, b, c] = [0, 1, 2].map(|column| model.rotation[(axis, column)]);
-            let (shift, target) = (model.translation[axis], &target[block]);
+            let [a, b, c] = [0, 1, 2].map(|column| rotation[(axis, column)]);
+            let (shift, target) = (translation[axis], &target[block]);
             for lane in 0..LANES {
                 let difference = a * x[lane] + b * y[lane] + c * z[lane] + shift - target[lane];
                 squared[lane] += difference * difference;
@@ -156,19 +156,12 @@ fn at(columns: &[PairColumn; 3], index: usize) -> Vector3<f64> {
     Vector3::from_fn(|axis, _| f64::from(columns[axis][block][lane]))
 }
 
-/// A motion in single precision.
-struct Model {
-    rotation: Matrix3<f32>,
-    translation: Vector3<f32>,
-}
+/// Rotation and translation of a motion in single precision.
+type Model = (Matrix3<f32>, Vector3<f32>);
 
-impl Model {
-    fn new(motion: &Isometry3<f64>) -> Self {
-        Self {
-            rotation: motion.rotation.to_rotation_matrix().into_inner().cast(),
-            translation: motion.translation.vector.cast(),
-        }
-    }
+fn model_of(motion: &Isometry3<f64>) -> Model {
+    let rotation = motion.rotation.to_rotation_matrix().into_inner().cast();
+    (rotation, motion.translation.vector.cast())
 }
 
 #[cfg(test)]

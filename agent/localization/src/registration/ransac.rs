@@ -115,17 +115,11 @@ pub fn solve(
     let near = best.map(|best| pairs.near(&best, refine::CUTOFF_SCALES * scale_m));
     let near = near.unwrap_or_default();
     let Some(best) = best.filter(|_| near.len() >= required) else {
-        return Err(NoRegistration::TooFewInliers {
-            found: near.len(),
-            required,
-            given: correspondences.len(),
-        });
+        let given = correspondences.len();
+        return Err(NoRegistration::TooFewInliers(near.len(), given, required));
     };
     let refined = refine::converge(&near, &best, scale_m, FINAL_STEPS);
-    let refined = refined.map_err(|reason| NoRegistration::Degenerate {
-        inliers: near.len(),
-        reason,
-    })?;
+    let refined = refined.map_err(|reason| NoRegistration::Degenerate(near.len(), reason))?;
     // The fit has six degrees of freedom and may tilt beyond the limit.
     let motion = match config.allows_tilt_of(&refined) {
         true => refined,
@@ -355,14 +349,7 @@ mod tests {
     fn thin_evidence_is_no_pose() {
         let config = RansacConfig::default();
         let none = solve(&[], &config).unwrap_err();
-        assert_eq!(
-            none,
-            NoRegistration::TooFewCorrespondences {
-                usable: 0,
-                given: 0,
-                required: 12
-            }
-        );
+        assert_eq!(none, NoRegistration::TooFewCorrespondences(0, 0, 12));
         let nonsense = TestProblem {
             count: 200,
             outliers: 1.0,
@@ -371,14 +358,7 @@ mod tests {
         .drawn(6);
         let few = solve(&nonsense.pairs, &config).unwrap_err();
         assert!(
-            matches!(
-                few,
-                NoRegistration::TooFewInliers {
-                    found: 0..12,
-                    required: 12,
-                    given: 200
-                }
-            ),
+            matches!(few, NoRegistration::TooFewInliers(0..12, 200, 12)),
             "{few}"
         );
         // All at one position: any motion is unconstrained.
@@ -404,7 +384,7 @@ mod tests {
             .collect();
         assert!(matches!(
             solve(&line, &config),
-            Err(NoRegistration::Degenerate { .. })
+            Err(NoRegistration::Degenerate(..))
         ));
     }
 

@@ -150,11 +150,8 @@ pub fn consensus(
         .collect();
     // Step: one fit per seed. Without a seed, in tiny sets, there is none.
     let Some((target_from_source, inlier_count)) = points.best_fit(&sets, config) else {
-        return Err(NoRegistration::TooFewInliers {
-            found: 0,
-            required: SMALL_SET,
-            given: correspondences.len(),
-        });
+        let given = correspondences.len();
+        return Err(NoRegistration::TooFewInliers(0, given, SMALL_SET));
     };
     Ok(Consensus {
         confidence,
@@ -370,7 +367,7 @@ mod tests {
         let config = Sc2PcrConfig::default();
         assert!(matches!(
             solve(&[], &config),
-            Err(NoRegistration::TooFewCorrespondences { given: 0, .. })
+            Err(NoRegistration::TooFewCorrespondences(_, 0, _))
         ));
         let nonsense = TestProblem {
             count: 60,
@@ -380,13 +377,13 @@ mod tests {
         .drawn(6);
         assert!(matches!(
             solve(&nonsense.pairs, &config),
-            Err(NoRegistration::TooFewInliers { .. })
+            Err(NoRegistration::TooFewInliers(..))
         ));
         let mut unusable = nonsense.pairs;
         unusable.iter_mut().for_each(|pair| pair.weight = f32::NAN);
         assert!(matches!(
             solve(&unusable, &config),
-            Err(NoRegistration::TooFewCorrespondences { usable: 0, .. })
+            Err(NoRegistration::TooFewCorrespondences(0, ..))
         ));
         let pair = Correspondence {
             source_m: [1.0; 3],

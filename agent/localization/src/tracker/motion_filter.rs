@@ -25,6 +25,8 @@ const SLIP_STD_M: f64 = 0.05;
 const VERTICAL_ACCELERATION_STD: f64 = 0.1;
 /// Standard deviation of a measured speed without its scale, metres per second: OpenCDA's.
 const SPEED_STD_MPS: f64 = 0.2;
+/// Time within which errors of a measured speed repeat, seconds: a speed that is late, or smoothed.
+const SPEED_ERROR_TIME_S: f64 = 0.3;
 /// Standard deviation of the unknown scale of the speed: radius of the wheels, tyres, calibration.
 const SCALE_STD: f64 = 0.1;
 /// Standard deviation of the change of that scale after one second.
@@ -174,29 +176,36 @@ impl MotionFilter {
             step * self.height_covariance * step.transpose() + lifted * lifted.transpose();
     }
 
-    /// Uses the speed that the vehicle measured at the time of the state.
-    pub(super) fn correct_speed(&mut self, speed_mps: f64) {
-        let (off, variance, selects) = self.speed_innovation(speed_mps);
+    /// Uses the speed that the vehicle measured at the time of the state, `time_s` after the one before it. All that are
+    /// measured while errors repeat count as one.
+    pub(super) fn correct_speed(&mut self, speed_mps: f64, time_s: f64) {
+        let repeated = (SPEED_ERROR_TIME_S / time_s).max(1.0);
+        let (off, variance, selects) = self.speed_innovation(speed_mps, repeated);
         let gain = self.covariance * selects.transpose() / variance;
         self.move_by(&(gain * off), &(Covariance::identity() - gain * selects));
     }
 
     /// Squared Mahalanobis distance between a speed that the vehicle measured at the time of the state and the state.
     pub(super) fn speed_distance_squared(&self, speed_mps: f64) -> f64 {
-        let (off, variance, _) = self.speed_innovation(speed_mps);
+        let (off, variance, _) = self.speed_innovation(speed_mps, 1.0);
         off * off / variance
     }
 
     /// Measured speed at its scale minus that of the state (m/s), the variance of the difference, and its derivative by
-    /// the state, negative. It is linear in the state: the speed of the state need not be known.
-    fn speed_innovation(&self, speed_mps: f64) -> (f64, f64, RowSVector<f64, STATES>) {
+    /// the state, negative; the error of the speed counts `repeated` times. It is linear in the state: the speed of the
+    /// state need not be known.
+    fn speed_innovation(
+        &self,
+        speed_mps: f64,
+        repeated: f64,
+    ) -> (f64, f64, RowSVector<f64, STATES>) {
         let mut selects = RowSVector::<f64, STATES>::zeros();
         selects[SPEED] = 1.0;
         selects[SCALE] = -speed_mps;
         let off = speed_mps * (1.0 + self.state[SCALE]) - self.state[SPEED];
         // The noise is that of the measurement alone: the error of the scale is in the covariance.
-        let variance =
-            (selects * self.covariance * selects.transpose())[0] + SPEED_STD_MPS * SPEED_STD_MPS;
+        let noise = repeated * SPEED_STD_MPS * SPEED_STD_MPS;
+        let variance = (selects * self.covariance * selects.transpose())[0] + noise;
         (off, variance, selects)
     }
 

@@ -67,7 +67,9 @@ impl VehicleTrack {
             filter.advance(capture_nanos, yaw_rate_rad_s);
         }
         match motion.speed_mps.filter(|speed| speed.is_finite()) {
-            Some(speed) if trust.admits(&self.unaided, speed) => self.filter.correct_speed(speed),
+            Some(speed) if trust.admits(&self.unaided, speed) => {
+                self.filter.correct_speed(speed, time_s);
+            }
             Some(_) => self.filter = self.unaided.clone(),
             None => {}
         }

@@ -10,7 +10,6 @@ use agent_offline::evaluation::{
 };
 use agent_offline::icp_map::{IcpMapPose, read_map};
 use agent_offline::sweep_database::repeated;
-use anyhow::Context;
 use clap::{ArgGroup, ValueEnum};
 use dataset::{self, LeftOut};
 use localization::baselines::{LightLoc, ScanContext, load_baseline, load_descriptor};
@@ -38,6 +37,7 @@ use protocol::config::Section;
 use serde::Serialize;
 use serde_json::json;
 use support::atomic_file;
+use support::file_error::AtFile;
 use support::output;
 use support::provenance::Provenance;
 use terminal::progress;
@@ -48,7 +48,8 @@ use super::scene_heads::{
 };
 use support::cli::{BadInput, Outcome};
 
-/// Options that change the tracker alone.
+/// Options that change the tracker alone. What they require is a group of one option, here as below: clap forgets the
+/// requirement of an option that another excludes.
 const TRACKER_OPTIONS: [&str; 4] = [
     "tracking_measure_every",
     "tracking_phase",
@@ -58,7 +59,7 @@ const TRACKER_OPTIONS: [&str; 4] = [
 
 /// Localize recorded sweeps and compare with their true poses.
 #[derive(Debug, clap::Args)]
-#[command(group = ArgGroup::new("tracker").args(TRACKER_OPTIONS).multiple(true).requires("tracked"))]
+#[command(group = ArgGroup::new("tracker").args(TRACKER_OPTIONS).multiple(true).requires("followed"))]
 pub(crate) struct Args {
     /// Data sets, splits or scenarios of the heads' scenes; the layout is detected.
     #[arg(long, alias = "scene", value_name = "DIR", num_args = 1.., required = true)]
@@ -82,11 +83,12 @@ pub(crate) struct Args {
         long,
         value_name = "DIR",
         num_args = 1..,
+        group = "drives",
         conflicts_with_all = ["lightloc", "fit_confidence", "tracked", "solver"]
     )]
     retrieval: Vec<PathBuf>,
     /// Descriptor of a sweep that --retrieval compares.
-    #[arg(long, value_enum, default_value_t, requires = "retrieval")]
+    #[arg(long, value_enum, default_value_t, requires = "drives")]
     by: RetrievalBy,
     /// Register every sweep against a point-cloud map of these drives through the same scene (ICP), starting at the
     /// pose of the GNSS receiver, instead of networks.
@@ -94,6 +96,7 @@ pub(crate) struct Args {
         long,
         value_name = "DIR",
         num_args = 1..,
+        group = "point_map",
         conflicts_with_all = ["encoder", "head", "baseline", "lightloc", "retrieval", "fit_confidence", "solver"]
     )]
     icp_map: Vec<PathBuf>,
@@ -101,11 +104,11 @@ pub(crate) struct Args {
     #[arg(long, value_name = "FILE|NAME", conflicts_with_all = ["baseline", "lightloc", "retrieval", "icp_map", "fit_confidence"])]
     surfel_map: Option<PathBuf>,
     /// Distance between two sweeps on that point-cloud map, metres.
-    #[arg(long, value_name = "M", default_value_t = 5.0, requires = "icp_map")]
+    #[arg(long, value_name = "M", default_value_t = 5.0, requires = "point_map")]
     map_spacing_m: f64,
     /// Follow each vehicle from sweep to sweep (pose source tracked), and localize every sweep by itself beside it;
     /// files are written of the tracked poses.
-    #[arg(long, conflicts_with_all = ["baseline", "icp_map", "fit_confidence"])]
+    #[arg(long, group = "followed", conflicts_with_all = ["baseline", "icp_map", "fit_confidence"])]
     tracked: bool,
     /// Settings of the tracker.
     #[command(flatten)]
@@ -127,19 +130,19 @@ pub(crate) struct Args {
     seed: Option<u64>,
     /// Fit the confidence model and the rejection threshold to these sweeps, and write them into the head. Not on
     /// sweeps that results are reported on.
-    #[arg(long)]
+    #[arg(long, groups = ["fitted", "fits"])]
     fit_confidence: bool,
     /// Fit the size of the covariances to these sweeps and write it into the head, or with --surfel-map into that map; the
     /// confidence stays. From 2,995 poses on also the bound, which at most one of 1,000 exceeds.
-    #[arg(long, conflicts_with_all = ["fit_confidence", "baseline", "icp_map", "lightloc", "retrieval", "tracked"])]
+    #[arg(long, group = "fits", conflicts_with_all = ["baseline", "icp_map", "lightloc", "retrieval", "tracked"])]
     fit_covariance: bool,
     /// Reject as few poses as leave at most this share of wrong ones, by its upper 95 % confidence limit; of too few sweeps
     /// for that, as leave the smallest limit (--fit-confidence, --fit-covariance).
-    #[arg(long, value_name = "SHARE", conflicts_with_all = ["good_loss", "surfel_map"])]
+    #[arg(long, value_name = "SHARE", requires = "fits", conflicts_with_all = ["good_loss", "surfel_map"])]
     max_wrong: Option<f64>,
     /// Largest share of poses less than 3 m off that --fit-confidence may reject.
     #[arg(long, value_name = "SHARE", default_value_t = 0.01)]
-    #[arg(requires = "fit_confidence")]
+    #[arg(requires = "fitted")]
     good_loss: f64,
     /// Write a row per sweep.
     #[arg(long, value_name = "FILE")]
@@ -188,11 +191,6 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     let (option, rejection) = args.rejection();
     let checked = rejection.check();
     checked.map_err(|error| BadInput::new(format!("{option}: {error}")))?;
-    if args.max_wrong.is_some() && !args.fits() {
-        return Err(
-            BadInput::new("--max-wrong is for --fit-confidence or --fit-covariance").into(),
-        );
-    }
     if args.seed.is_some() && args.solver == Search::Sc2pcr {
         return Err(BadInput::new("--seed is for --solver ransac: sc2pcr draws nothing").into());
     }
@@ -299,13 +297,11 @@ impl Args {
             scenarios.extend(dataset::open(folder)?.scenarios);
         }
         let mut files: Vec<PathBuf> = self.baseline.iter().cloned().collect();
-        if self.surfel_map.is_some() {
-            files.push(surfel_map(self.surfel_map.as_deref())?);
-        }
+        files.push(surfel_map(self.surfel_map.as_deref())?);
         for head in heads.filter(|_| self.uses_head()) {
             files.extend([self.encoder(head)?, head.to_owned()]);
         }
-        // A surfel map in place of a head has no encoder.
+        // Without a map, or with one in place of a head, which has no encoder.
         files.retain(|file| !file.as_os_str().is_empty());
         let commit = env!("V2VLOC_COMMIT");
         Ok(dataset::provenance(&scenarios, files, commit)?)
@@ -364,12 +360,15 @@ impl Args {
         if let Some(weights) = &self.baseline {
             return load_baseline(weights, inference.device, plain).map_err(BadInput::of);
         }
+        let encoder = self.encoder(head)?;
         if let Some(search) = MapSearch::of_file(head).map_err(BadInput::of)? {
             let needs_head = self.lightloc || self.fit_confidence || self.max_wrong.is_some();
-            if needs_head || !drives.is_empty() {
+            let chooses = self.solver == Search::Sc2pcr || self.seed.is_some();
+            if needs_head || chooses || !drives.is_empty() {
                 let head = head.display();
                 return Err(BadInput::new(format!(
-                    "{head}: a surfel map, --lightloc, --retrieval, --fit-confidence and --max-wrong need a head"
+                    "{head}: a surfel map, --lightloc, --retrieval, --fit-confidence, --max-wrong, --solver and --seed need \
+                     a head"
                 )));
             }
             return self.registered(Box::new(search));
@@ -379,7 +378,7 @@ impl Args {
             true => Localizer::load_without_confidence,
             false => Localizer::load,
         };
-        let mut localizer = load(&self.encoder(head)?, head, inference).map_err(BadInput::of)?;
+        let mut localizer = load(&encoder, head, inference).map_err(BadInput::of)?;
         if self.lightloc {
             return Ok(Box::new(LightLoc::new(localizer, plain)));
         }
@@ -464,12 +463,9 @@ impl Args {
             write_fit(head, CONFIDENCE_KEY, &model)?;
             output::note(report_line(&report));
         }
-        let map = surfel_map(self.surfel_map.as_deref())?;
-        let fitted = if map.as_os_str().is_empty() {
-            head
-        } else {
-            &map
-        };
+        let map = Some(surfel_map(self.surfel_map.as_deref())?);
+        let map = map.filter(|map| !map.as_os_str().is_empty());
+        let fitted = map.as_deref().unwrap_or(head);
         match scale {
             Ok(scale) => write_fit(fitted, COVARIANCE_KEY, &scale),
             Err(reason) => reset_scale(head, &reason),
@@ -510,20 +506,16 @@ impl Args {
 
     fn write(&self, sweeps: &[EvaluatedSweep]) -> anyhow::Result<()> {
         if let Some(path) = &self.csv {
-            atomic_file::write(path, csv(sweeps)).with_context(|| writing(path))?;
+            atomic_file::write(path, csv(sweeps)).at(path)?;
         }
         if let Some(path) = &self.error_table {
-            atomic_file::write(path, error_table(sweeps)).with_context(|| writing(path))?;
+            atomic_file::write(path, error_table(sweeps)).at(path)?;
         }
         if let Some(path) = &self.plot {
             figures::save_png(&reliability_charts(sweeps), path)?;
         }
         Ok(())
     }
-}
-
-fn writing(path: &Path) -> String {
-    format!("writing {}", path.display())
 }
 
 /// Writes fitted numbers into a file of weights or a map.
@@ -588,60 +580,49 @@ fn table(summary: &LocalizationSummary) -> String {
     let [bad_share, good_share] = shares.map(|share| share.map_or("-".into(), percent));
     let stages = ms.iter().filter(|(stage, _)| *stage != "total");
     let stages = joined(stages.map(|(stage, ms)| format!("{stage} {ms:.1}")));
-    let mut rows = vec![
-        format!(
-            "sweeps     {}, {} without a pose {:?}",
-            summary.sweeps, summary.no_pose, summary.outcomes
-        ),
-        format!("success    {under_3m} under 3 m, {under_1m} under 1 m"),
-        format!(
-            "position   mean {mean_m} m, median {p50_m}, 95 % {p95_m}, 99 % {p99_m}, largest {max_m}"
-        ),
-        format!(
-            "rotation   mean {mean_deg} degrees, median {p50_deg}, 95 % {p95_deg}, largest {max_deg}"
-        ),
-        format!(
-            "sigma      rank correlation {sigma} (inlier ratio {ratio}), calibration error {calibration}"
-        ),
-        format!(
-            "rejected   {} poses: {bad_share} of {} errors above 3 m, {good_share} of the others",
-            rejected.poses, rejected.bad
-        ),
-        format!(
-            "time       {total_ms} ms median, {:.1} mean: {stages}",
-            summary.mean_ms
-        ),
-    ];
+    let mut text = format!(
+        "sweeps     {}, {} without a pose {:?}\n\
+         success    {under_3m} under 3 m, {under_1m} under 1 m\n\
+         position   mean {mean_m} m, median {p50_m}, 95 % {p95_m}, 99 % {p99_m}, largest {max_m}\n\
+         rotation   mean {mean_deg} degrees, median {p50_deg}, 95 % {p95_deg}, largest {max_deg}\n\
+         sigma      rank correlation {sigma} (inlier ratio {ratio}), calibration error {calibration}\n\
+         rejected   {} poses: {bad_share} of {} errors above 3 m, {good_share} of the others\n\
+         time       {total_ms} ms median, {:.1} mean: {stages}\n",
+        summary.sweeps,
+        summary.no_pose,
+        summary.outcomes,
+        rejected.poses,
+        rejected.bad,
+        summary.mean_ms
+    );
     if let Some(low) = summary.low_coverage {
         let (sweeps, no_pose) = (low.sweeps, low.no_pose);
-        rows.push(format!(
-            "coverage   {sweeps} sweeps of low coverage (few training sweeps nearby), {no_pose} of them without a pose"
-        ));
+        text += &format!(
+            "coverage   {sweeps} sweeps of low coverage (few training sweeps nearby), {no_pose} of them without a pose\n"
+        );
     }
     if let Some(registered) = summary.registered {
         let poses = summary.sweeps - summary.no_pose + rejected.poses;
-        rows.push(format!(
-            "registered {registered} of {poses} poses, to the surfel map"
-        ));
+        text += &format!("registered {registered} of {poses} poses, to the surfel map\n");
     }
     if !summary.beyond_95.is_empty() {
         let shares = summary.beyond_95.iter();
         let shares = joined(shares.map(|(axis, share)| format!("{axis} {}", percent(*share))));
-        rows.push(format!("covariance {shares} of the errors beyond 95 %"));
+        text += &format!("covariance {shares} of the errors beyond 95 %\n");
     }
     if let Some(integrity) = summary.integrity {
         let (share, p50_m) = (percent(integrity.exceeded_share), integrity.p50_bound_m);
-        rows.push(format!(
-            "integrity  {share} of the errors exceed their bound of 95 % (median {p50_m:.2} m)"
-        ));
+        text += &format!(
+            "integrity  {share} of the errors exceed their bound of 95 % (median {p50_m:.2} m)\n"
+        );
     }
     if let Some(bound) = summary.bound {
         let (exceeded, poses, p50_m) = (bound.exceeded, bound.poses, bound.p50_bound_m);
-        rows.push(format!(
-            "bound      {exceeded} of {poses} errors exceed their bound of one in 1,000 (median {p50_m:.2} m)"
-        ));
+        text += &format!(
+            "bound      {exceeded} of {poses} errors exceed their bound of one in 1,000 (median {p50_m:.2} m)\n"
+        );
     }
-    rows.join("\n") + "\n"
+    text
 }
 
 fn joined(parts: impl Iterator<Item = String>) -> String {

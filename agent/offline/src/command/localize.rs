@@ -5,7 +5,8 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use agent_offline::evaluation::estimate_pose;
-use dataset::{self, IntensityScale, LeftOut, LoadOptions, Problem, Scenario, findings};
+use agent_offline::sweep_database::present_sweeps;
+use dataset::{self, IntensityScale, LeftOut, LoadOptions, Problem, ReadError, Scenario, findings};
 use indicatif::ProgressBar;
 use localization::pgc::head_files::encoder_or_named;
 use localization::pgc::wrong_place::wrong_place_hint;
@@ -22,7 +23,8 @@ use tch::Device;
 
 /// Localize every sweep of scenes once and write poses and confidences to a table, for training and evaluation.
 ///
-/// Scenarios that are in the table already are skipped, so an interrupted run continues where it stopped.
+/// Scenarios that are in the table already are skipped, so an interrupted run continues where it stopped; their sweeps that
+/// the table lacks are named.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
     /// Data sets, splits or scenarios.
@@ -74,14 +76,14 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     // All heads are found before any is computed with.
     let files = with_files(&args.head)?;
     let digests = FileDigests::default();
-    let mut tasks = Vec::new();
+    let (mut tasks, mut left_out) = (Vec::new(), LeftOut::default());
     for scenario in &scenarios {
         let config = args.config(head_of(&files, scenario)?)?;
         let origin = origin(scenario, &config, &digests).map_err(BadInput::of)?;
         let origin = origin + precision_text(args.precision);
         match done.origin(&scenario.name) {
             None => tasks.push((scenario, config, origin)),
-            Some(before) if before == origin => {}
+            Some(before) if before == origin => add_missing(&done, scenario, &mut left_out),
             Some(before) => {
                 let (out, name) = (args.out.display(), &scenario.name);
                 return Err(BadInput::new(format!(
@@ -92,13 +94,13 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
             }
         }
     }
-    let sweeps: usize = tasks.iter().map(|(scenario, ..)| frames(scenario)).sum();
-    if sweeps == 0 && done.is_empty() {
+    let sweeps = tasks.iter().map(|(scenario, ..)| present_sweeps(scenario));
+    let sweeps = sweeps.flatten().count();
+    if sweeps == 0 && done.rows() == 0 {
         return Err(BadInput::new(format!("no sweep in {:?}", args.dataset)).into());
     }
     let bar = progress::bar(sweeps, "sweeps");
     let mut found = 0;
-    let mut left_out = LeftOut::default();
     left_out.add_findings(findings::sampled(&scenarios, IntensityScale::AUTO, None));
     let inference = Inference::new(Device::Cpu, args.precision);
     for of_head in tasks.chunk_by(|(_, one, _), (_, next, _)| one == next) {
@@ -119,7 +121,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     }
     output::line(format_args!(
         "{sweeps} sweeps, {found} with a pose; {} were in the table before: {}",
-        done.len(),
+        done.rows(),
         args.out.display()
     ))?;
     Ok(left_out.print())
@@ -169,31 +171,69 @@ fn localized<'a>(
         source.begin();
         for tick in (0..scenario.ticks.len()).filter(|&tick| scenario.is_present(agent, tick)) {
             bar.inc(1);
-            let frame = match scenario.load(agent, tick, &LoadOptions::default()) {
-                Ok(frame) => frame,
-                Err(error) => {
-                    left_out.add_unreadable(agent, Problem::from(&error));
-                    continue;
-                }
-            };
-            rows.push(PoseRow {
-                cav,
-                capture_nanos: frame.capture_nanos,
-                estimate: estimate_pose(source, &frame, None),
-            });
+            match scenario.load(agent, tick, &LoadOptions::default()) {
+                Ok(frame) => rows.push(PoseRow {
+                    cav,
+                    capture_nanos: frame.capture_nanos,
+                    estimate: estimate_pose(source, &frame, None),
+                }),
+                Err(error) => left_out.add_unreadable(agent, Problem::from(&error)),
+            }
         }
     }
     rows
 }
 
-/// Number of frames of a scenario.
-fn frames(scenario: &Scenario) -> usize {
-    scenario.agents.len() * scenario.ticks.len() - scenario.absent_frames()
+/// Names the sweeps of a scenario that its table lacks.
+fn add_missing(table: &PoseTable, scenario: &Scenario, left_out: &mut LeftOut) {
+    for (agent, tick) in present_sweeps(scenario) {
+        let capture_nanos = scenario.ticks[tick].capture_nanos;
+        let cav = &scenario.agents[agent];
+        if table.get(&scenario.name, cav, capture_nanos).is_none() {
+            let reason = "the table has no row of this sweep, which could not be read before";
+            let path = scenario.points_path(agent, tick, None);
+            let missing =
+                path.map_or_else(|error| error, |path| ReadError::malformed(&path, reason));
+            left_out.add_unreadable(agent, Problem::from(&missing));
+        }
+    }
 }
 
 #[cfg(test)]
 mod tests {
+    use simulator::generate::{Subset, SynthOptions, generate};
+
     use super::*;
+
+    #[test]
+    fn sweeps_that_the_table_lacks_are_named_again() {
+        let folder = tempfile::tempdir().unwrap();
+        let drive = folder.path().join("drive");
+        let options = SynthOptions {
+            frames: 2,
+            ..SynthOptions::new(Subset::Town1loc, 11, drive.clone())
+        };
+        generate(&options, &|_| {}).unwrap();
+        let scenario = dataset::open(&drive).unwrap().scenarios.swap_remove(0);
+        let rows = scenario.ticks.iter().map(|tick| PoseRow {
+            cav: &scenario.agents[0],
+            capture_nanos: tick.capture_nanos,
+            estimate: localization::pose_source::NO_SOURCE,
+        });
+        let rows: Vec<PoseRow<'_>> = rows.collect();
+        let missing = |rows: &[PoseRow<'_>]| {
+            let out = folder.path().join(rows.len().to_string());
+            PoseTable::append(&out, &scenario.name, "data 0", rows).unwrap();
+            let mut left_out = LeftOut::default();
+            add_missing(&PoseTable::read(&out).unwrap(), &scenario, &mut left_out);
+            (left_out.ticks, left_out.reasons())
+        };
+        assert_eq!(missing(&rows).0, 0);
+        let (ticks, reasons) = missing(&rows[..1]);
+        let stem = &scenario.ticks[1].stem;
+        let names_it = reasons.contains(stem) && reasons.contains("no row of this sweep");
+        assert!(ticks == 1 && names_it, "{reasons}");
+    }
 
     #[test]
     fn poses_in_another_number_format_have_another_origin() {

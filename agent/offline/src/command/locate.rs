@@ -166,11 +166,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
         ));
     }
     if found == 0 && lost > 0 {
-        let head = head.display();
-        output::note(format_args!(
-            "no cloud found itself: is {head} the head of this place and this LiDAR, and were these roads driven for \
-             it? Its map is {place}"
-        ));
+        output::note(lost_text(&head, &place));
     }
     if let Some(area) = localizer.driven_area().filter(|_| lost > 0) {
         let area = area.text();
@@ -201,7 +197,7 @@ impl Args {
     ) -> anyhow::Result<Located> {
         let map = map.to_owned();
         let (cloud, read) = match file {
-            Ok(file) => (file.path().display().to_string(), file.read()),
+            Ok(file) => (file.path.display().to_string(), file.read()),
             Err(error) => {
                 let path = error.path().map(|path| path.display().to_string());
                 (path.unwrap_or_default(), Err(error))
@@ -227,13 +223,13 @@ impl Args {
             false => self.y_axis,
         };
         if y_axis == CloudYAxis::Right {
-            mirror(&mut points);
+            points.mirror();
         }
         let mut localization = localizer.localize(LocalizerInput::of(&points))?;
         let mut is_mirrored = y_axis == CloudYAxis::Right;
         // A mirrored cloud looks like another place, so a pose tells which direction y has.
         if y_axis == CloudYAxis::Auto && published(&localization).is_none() {
-            mirror(&mut points);
+            points.mirror();
             let other = localizer.localize(LocalizerInput::of(&points))?;
             if published(&other).is_some() {
                 (localization, is_mirrored) = (other, true);
@@ -243,7 +239,10 @@ impl Args {
             cloud,
             map,
             pose: published(&localization).map(LocatedPose::of),
-            no_pose: reason(&localization.estimate),
+            no_pose: match &localization.estimate {
+                PoseEstimate::Pose { .. } => None,
+                PoseEstimate::NoPose { reason, .. } => Some(<&str>::from(reason).replace('_', " ")),
+            },
             error: None,
             inliers: localization.inlier_count,
             inlier_ratio: localization.inlier_ratio,
@@ -255,23 +254,21 @@ impl Args {
     }
 }
 
+/// The question that remains where no cloud found itself; a surfel map may have no name.
+fn lost_text(head: &Path, place: &str) -> String {
+    let head = head.display();
+    let map = match place {
+        "" => String::new(),
+        _ => format!(" Its map is {place}"),
+    };
+    format!(
+        "no cloud found itself: is {head} the head of this place and this LiDAR, and were these roads driven for it?{map}"
+    )
+}
+
 /// The pose, unless it is rejected.
 fn published(localization: &Localization) -> Option<FoundPose> {
     localization.found.filter(|found| !found.is_rejected)
-}
-
-fn reason(estimate: &PoseEstimate) -> Option<String> {
-    match estimate {
-        PoseEstimate::Pose { .. } => None,
-        PoseEstimate::NoPose { reason, .. } => Some(<&str>::from(reason).replace('_', " ")),
-    }
-}
-
-/// Negates y, in place.
-fn mirror(points: &mut protocol::PointCloud) {
-    for point in &mut points.xyzi {
-        point[1] = -point[1];
-    }
 }
 
 impl LocatedPose {
@@ -334,6 +331,13 @@ mod tests {
             lowest_m: None,
             is_mirrored: false,
         }
+    }
+
+    #[test]
+    fn a_map_without_a_name_is_not_named() {
+        let text = |place| lost_text(Path::new("surfels.safetensors"), place);
+        assert!(text("").ends_with("driven for it?"), "{}", text(""));
+        assert!(text("town").ends_with("for it? Its map is town"));
     }
 
     #[test]

@@ -202,10 +202,8 @@ fn name_of(folder: &Path) -> String {
 
 /// Report as text.
 fn text(report: &PlaceReport) -> String {
-    let accuracy = match &report.held_out {
-        Some(accuracy) => accuracy.text(),
-        None => "not measured: too few sweeps".to_owned(),
-    };
+    let accuracy = report.held_out.map(|accuracy| accuracy.text());
+    let accuracy = accuracy.unwrap_or("not measured: too few sweeps".to_owned());
     let confidence = match &report.confidence {
         Some(fit) => {
             let (bad, good, limit) = (fit.bad, fit.sweeps - fit.bad, 100.0 * fit.wrong_limit);

@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use agent_offline::sweep_database::add_faults;
+use agent_offline::sweep_database::open_drives;
 use dataset::{LeftOut, LoadOptions};
 use localization::pgc::Localizer;
 use localization::pgc::head_files::{encoder_or_named, head_config};
@@ -44,8 +44,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     check_place((&args.head, &config), &generated_maps(&args.dataset)?, &[])?;
     let (mut search, mut left_out, mut observed) = (ScaleSearch::default(), LeftOut::default(), 0);
     for folder in &args.dataset {
-        let drives = dataset::open(folder).map_err(BadInput::of)?;
-        add_faults(&drives, &mut left_out);
+        let drives = open_drives(folder, &mut left_out).map_err(BadInput::of)?;
         for scenario in &drives.scenarios {
             let (ticks, agents) = (scenario.ticks.len(), scenario.agents.len());
             let count = (ticks * agents).min(args.sweeps.into());

@@ -26,23 +26,16 @@ impl FromStr for SceneHeadFile {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
-        let Some((map, weights)) = text.split_once('=') else {
-            return Ok(Self {
-                map: None,
-                weights: text.into(),
-            });
-        };
-        let (name, seed) = map.split_once(':').unwrap_or((map, "0"));
-        let seed = seed
-            .parse()
-            .map_err(|_| format!("{seed:?} is no seed of a map"))?;
-        Ok(Self {
-            map: Some(GeneratedMap {
-                name: name.to_owned(),
-                seed,
-            }),
-            weights: weights.into(),
-        })
+        let (mut map, mut weights) = (None, text);
+        if let Some((of, file)) = text.split_once('=') {
+            let (name, seed) = of.split_once(':').unwrap_or((of, "0"));
+            let parsed = seed.parse();
+            let seed = parsed.map_err(|_| format!("{seed:?} is no seed of a map"))?;
+            let name = name.to_owned();
+            (map, weights) = (Some(GeneratedMap { name, seed }), file);
+        }
+        let weights = weights.into();
+        Ok(Self { map, weights })
     }
 }
 

@@ -4,11 +4,11 @@ mod summary;
 mod table;
 
 use crate::Error;
-use crate::sweep_database::{add_faults, posed, present_sweeps, repeated};
+use crate::sweep_database::{open_drives, posed, present_sweeps, repeated};
 use std::path::PathBuf;
 
 use dataset::frame::Frame;
-use dataset::{self, LeftOut, LoadOptions, Problem, ReadError};
+use dataset::{LeftOut, LoadOptions, Problem, ReadError};
 use protocol::{CavId, Pose, PoseError, PoseEstimate};
 
 pub use summary::{
@@ -217,7 +217,9 @@ fn evaluate_with(
     if let Some(reason) = repeated(&options.scenes)? {
         return Err(Error::Input(reason));
     }
-    let datasets = options.scenes.iter().map(|dir| dataset::open(dir));
+    let mut evaluated = Evaluated::default();
+    let scenes = options.scenes.iter();
+    let datasets = scenes.map(|folder| open_drives(folder, &mut evaluated.left_out));
     let datasets = datasets.collect::<Result<Vec<_>, _>>()?;
     let mut all = Vec::new();
     for scenario in datasets.iter().flat_map(|dataset| &dataset.scenarios) {
@@ -230,11 +232,7 @@ fn evaluate_with(
         lidar_variant: options.variant.clone(),
         ..LoadOptions::default()
     };
-    let mut evaluated = Evaluated::default();
     let mut last = None;
-    for dataset in &datasets {
-        add_faults(dataset, &mut evaluated.left_out);
-    }
     for (place, &(scenario, (agent, tick))) in chosen.iter().enumerate() {
         on_sweep(place + 1, chosen.len());
         let (frame, truth) = match posed(scenario, agent, tick, &load) {

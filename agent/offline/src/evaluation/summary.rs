@@ -123,12 +123,8 @@ pub struct RejectionSummary {
     pub good_share: Option<f64>,
 }
 
-/// An estimated pose and its error.
-#[derive(Debug, Clone, Copy)]
-struct Judged {
-    found: FoundPose,
-    error_m: f64,
-}
+/// An estimated pose and its error, metres.
+type Judged = (FoundPose, f64);
 
 impl LocalizationSummary {
     /// Summary of sweeps.
@@ -143,9 +139,9 @@ impl LocalizationSummary {
             good.count() as f64 / sweeps.len().max(1) as f64
         });
         let judged = judged(sweeps);
-        let sigmas = each(&judged, |pose| pose.found.sigma);
-        let ratios = each(&judged, |pose| pose.found.evidence.inlier_ratio);
-        let errors = each(&judged, |pose| pose.error_m);
+        let sigmas = each(&judged, |(found, _)| found.sigma);
+        let ratios = each(&judged, |(found, _)| found.evidence.inlier_ratio);
+        let errors = each(&judged, |(_, error_m)| *error_m);
         let calibration = calibration(&judged);
         let mut outcomes = BTreeMap::new();
         for sweep in sweeps {
@@ -189,40 +185,34 @@ impl LocalizationSummary {
 
 fn low_coverage(sweeps: &[EvaluatedSweep]) -> Option<CoverageSummary> {
     let known = sweeps.iter().any(|sweep| sweep.is_covered.is_some());
-    let outside = || {
-        sweeps
-            .iter()
-            .filter(|sweep| sweep.is_covered == Some(false))
-    };
+    let outside = sweeps.iter();
+    let outside = outside.filter(|sweep| sweep.is_covered == Some(false));
     known.then(|| CoverageSummary {
-        sweeps: outside().count(),
-        no_pose: (outside().filter(|sweep| sweep.published_error().is_none())).count(),
+        sweeps: outside.clone().count(),
+        no_pose: (outside.filter(|sweep| sweep.published_error().is_none())).count(),
     })
 }
 
 fn judged(sweeps: &[EvaluatedSweep]) -> Vec<Judged> {
-    let judged = sweeps.iter().filter_map(|sweep| {
-        Some(Judged {
-            found: sweep.localization.found?,
-            error_m: sweep.error()?.distance_m,
-        })
-    });
+    let judged = sweeps.iter();
+    let judged = judged.filter_map(|of| Some((of.localization.found?, of.error()?.distance_m)));
     judged.collect()
 }
 
 fn calibration(judged: &[Judged]) -> Vec<CalibrationBin> {
     let mut by_sigma = judged.to_vec();
-    by_sigma.sort_by(|a, b| a.found.sigma.total_cmp(&b.found.sigma));
+    by_sigma.sort_by(|(a, _), (b, _)| a.sigma.total_cmp(&b.sigma));
     let all = by_sigma.len();
     (0..BINS)
         .map(|bin| &by_sigma[bin * all / BINS..(bin + 1) * all / BINS])
         .filter(|poses| !poses.is_empty())
         .map(|poses| CalibrationBin {
             poses: poses.len(),
-            sigma: mean(&each(poses, |pose| pose.found.sigma)).unwrap_or(0.0),
-            observed: mean(&each(poses, |pose| observed(pose.error_m))).unwrap_or(0.0),
-            p50_m: median(&each(poses, |pose| pose.error_m)).unwrap_or(0.0),
-            success_3m: mean(&each(poses, |pose| f64::from(pose.error_m < BAD_M))).unwrap_or(0.0),
+            sigma: mean(&each(poses, |(found, _)| found.sigma)).unwrap_or(0.0),
+            observed: mean(&each(poses, |(_, error_m)| observed(*error_m))).unwrap_or(0.0),
+            p50_m: median(&each(poses, |(_, error_m)| *error_m)).unwrap_or(0.0),
+            success_3m: mean(&each(poses, |(_, error_m)| f64::from(*error_m < BAD_M)))
+                .unwrap_or(0.0),
         })
         .collect()
 }
@@ -233,13 +223,13 @@ fn each(poses: &[Judged], value: fn(&Judged) -> f64) -> Vec<f64> {
 
 fn rejected(judged: &[Judged]) -> RejectionSummary {
     let (good, bad): (Vec<&Judged>, Vec<&Judged>) =
-        judged.iter().partition(|pose| pose.error_m <= BAD_M);
+        judged.iter().partition(|(_, error_m)| *error_m <= BAD_M);
     let [bad_share, good_share] = [&bad, &good].map(|poses| {
-        let rejected = poses.iter().filter(|it| it.found.is_rejected).count();
+        let rejected = poses.iter().filter(|(found, _)| found.is_rejected).count();
         (!poses.is_empty()).then_some(rejected as f64 / poses.len() as f64)
     });
     RejectionSummary {
-        poses: judged.iter().filter(|it| it.found.is_rejected).count(),
+        poses: (judged.iter().filter(|(found, _)| found.is_rejected)).count(),
         bad: bad.len(),
         bad_share,
         good_share,
@@ -304,11 +294,10 @@ pub fn reliability_charts(sweeps: &[EvaluatedSweep]) -> Vec<Chart> {
     let bins = calibration(&judged);
     let published = sweeps.iter().filter_map(EvaluatedSweep::published_error);
     let [kept, rejected] = [("published", false), ("rejected", true)].map(|(name, is_rejected)| {
-        let poses = judged
-            .iter()
-            .filter(|pose| pose.found.is_rejected == is_rejected);
+        let poses = judged.iter();
+        let poses = poses.filter(|(found, _)| found.is_rejected == is_rejected);
         // The axis is logarithmic: errors beyond its ends are drawn there.
-        let points = poses.map(|pose| (pose.found.sigma, pose.error_m.clamp(0.01, 1000.0)));
+        let points = poses.map(|(found, error_m)| (found.sigma, error_m.clamp(0.01, 1000.0)));
         series(name, points.collect(), Mark::Dots)
     });
     let (all, published) = (sweeps.len(), published.count());

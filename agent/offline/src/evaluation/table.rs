@@ -10,7 +10,7 @@ const HEADER: &str = "scenario,cav,frame,true_x_m,true_y_m,true_z_m,true_yaw_deg
     sigma,outcome,cells,inliers,inlier_ratio,rms_m,inlier_epsilon_m,median_epsilon_m,position_std_m,rotation_std_deg,\
     second_inlier_ratio,second_rms_m,second_epsilon_m,moved_m,residual_quartile_m,information_per_m2,worst_axis_std_m,ms";
 
-/// One row per sweep; fields of sweeps without a pose are empty.
+/// One row per sweep; fields of sweeps without a pose are empty, and the evidence of methods without cells.
 pub fn csv(sweeps: &[EvaluatedSweep]) -> String {
     let mut text = CsvText::new(HEADER);
     sweeps.iter().for_each(|sweep| text.row(row(sweep)));
@@ -22,19 +22,22 @@ fn row(sweep: &EvaluatedSweep) -> Vec<String> {
     let (scenario, stem) = (sweep.scenario.clone(), sweep.stem.clone());
     let mut fields = vec![scenario, sweep.cav.to_string(), stem];
     fields.extend(pose(&sweep.truth));
-    let outcome = outcome(&localization.estimate).to_owned();
-    if let (Some(found), Some(error)) = (&localization.found, sweep.error()) {
+    let found = localization.found.zip(sweep.error());
+    if let Some((found, error)) = &found {
         fields.extend(pose(&found.world_from_sensor.into()));
         fields.extend([error.distance_m, error.angle_deg, found.sigma].map(four));
-        fields.push(outcome);
-        fields.extend(evidence_fields(&found.evidence));
-    } else {
-        // As many empty fields as pose (4), errors (2) and sigma (1) take.
-        fields.resize(fields.len() + 7, String::new());
-        fields.push(outcome);
-        // All of the evidence.
-        fields.resize(fields.len() + 15, String::new());
     }
+    let columns = || HEADER.split(',');
+    let before_outcome = columns().position(|column| column == "outcome");
+    fields.resize(before_outcome.unwrap_or_default(), String::new());
+    fields.push(outcome(&localization.estimate).to_owned());
+    // Methods without cells have no evidence; what stands for it is no measurement.
+    let evidence = found.map(|(found, _)| found.evidence);
+    if let Some(evidence) = evidence.filter(|evidence| evidence.cells > 0) {
+        fields.extend(evidence_fields(&evidence));
+    }
+    // All but the last, the time.
+    fields.resize(columns().count() - 1, String::new());
     let total_ms = localization.times.total().as_secs_f64() * 1e3;
     fields.push(format!("{total_ms:.3}"));
     fields
@@ -53,8 +56,8 @@ fn evidence_fields(evidence: &PoseEvidence) -> Vec<String> {
         ]
         .map(four),
     );
-    let second = evidence.second.as_ref().map(|second| {
-        [
+    if let Some(second) = &evidence.second {
+        fields.extend([
             four(second.inlier_ratio),
             four(second.rms_m),
             four(second.median_epsilon_m),
@@ -62,9 +65,8 @@ fn evidence_fields(evidence: &PoseEvidence) -> Vec<String> {
             four(second.residual_quartile_m),
             format!("{:.3}", second.information_per_m2),
             four(second.worst_axis_std_m),
-        ]
-    });
-    fields.extend(second.unwrap_or_default());
+        ]);
+    }
     fields
 }
 
@@ -98,7 +100,8 @@ pub fn error_table(sweeps: &[EvaluatedSweep]) -> String {
 mod tests {
     use super::super::tests::evaluated;
     use super::*;
-    use localization::pose_source::{ErrorTable, TableRow};
+    use localization::pgc::Localization;
+    use localization::pose_source::ErrorTable;
 
     #[test]
     fn every_row_has_every_column() {
@@ -117,6 +120,22 @@ mod tests {
     }
 
     #[test]
+    fn a_method_without_cells_has_no_evidence() {
+        let mut sweep = evaluated(1).swap_remove(0);
+        let times = sweep.localization.times.clone();
+        let estimate = sweep.localization.estimate;
+        sweep.localization = Localization::from_estimate(estimate, times);
+        let text = csv(&[sweep]);
+        let mut lines = text.lines().map(|line| line.split(',').collect::<Vec<_>>());
+        let (columns, fields) = (lines.next().unwrap(), lines.next().unwrap());
+        for (column, field) in columns.iter().zip(&fields).skip(14) {
+            let is_stated = ["outcome", "ms"].contains(column);
+            assert_eq!(field.is_empty(), !is_stated, "{column} {field}");
+        }
+        assert_eq!((columns[13], fields[14]), ("sigma", "pose"));
+    }
+
+    #[test]
     fn errors_are_replayed_as_they_were() {
         let sweeps = evaluated(40);
         let folder = tempfile::tempdir().unwrap();
@@ -125,10 +144,10 @@ mod tests {
         let table = ErrorTable::read(&path).unwrap();
         for (step, sweep) in sweeps.iter().enumerate() {
             match (table.row(0, step as u64), sweep.published_error()) {
-                (TableRow::Pose { error, .. }, Some(estimated)) => {
+                (Some((error, _)), Some(estimated)) => {
                     assert!((error.distance_m() - estimated.distance_m).abs() < 1e-3);
                 }
-                (TableRow::NoPose, None) => {}
+                (None, None) => {}
                 other => panic!("{other:?}"),
             }
         }

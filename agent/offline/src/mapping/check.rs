@@ -56,7 +56,7 @@ pub(super) fn check(
         let Some(truth) = frame.world_from_lidar else {
             continue;
         };
-        let (cloud, truth) = match copy {
+        let (mut cloud, truth) = match copy {
             0 => (frame.points, truth),
             _ => turned(&frame.points, &truth, &mut rng),
         };
@@ -69,8 +69,9 @@ pub(super) fn check(
             localization: localizer.localize(LocalizerInput::of(&cloud))?,
         };
         check.labelled.extend(sweep.labelled());
+        cloud.mirror();
         let mirrored = EvaluatedSweep {
-            localization: localizer.localize(LocalizerInput::of(&mirrored(&cloud)))?,
+            localization: localizer.localize(LocalizerInput::of(&cloud))?,
             ..sweep.clone()
         };
         // A straight street is its own mirror image: a pose near the true one is no example of a wrong pose.
@@ -95,14 +96,6 @@ fn turned(cloud: &PointCloud, world_from_sensor: &Pose, rng: &mut impl Rng) -> (
     (PointCloud { xyzi }, world_from_turned.into())
 }
 
-fn mirrored(cloud: &PointCloud) -> PointCloud {
-    let mut mirrored = cloud.clone();
-    for point in &mut mirrored.xyzi {
-        point[1] = -point[1];
-    }
-    mirrored
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -121,6 +114,8 @@ mod tests {
             });
         let moved = before - after;
         assert!(moved.norm() < 1e-5, "{moved}");
-        assert_eq!(mirrored(&cloud).xyzi[0], [10.0, 3.0, 1.0, 0.5]);
+        let mut mirrored = cloud;
+        mirrored.mirror();
+        assert_eq!(mirrored.xyzi[0], [10.0, 3.0, 1.0, 0.5]);
     }
 }

@@ -175,10 +175,7 @@ impl MapMaking<'_> {
     fn survey(&mut self) -> Result<MapSweeps> {
         let list = SweepList::open(&self.config.drives)?;
         self.at(format!("reading the poses of {} sweeps", list.len()));
-        let poses = list.poses().into_iter();
-        let positions: Vec<(usize, Option<Vector3<f64>>)> = poses
-            .map(|(drive, pose)| (drive, pose.map(|pose| pose.translation.vector)))
-            .collect();
+        let positions = list.positions();
         let (mut training, mut held) = (Vec::new(), Vec::new());
         let known: Vec<(usize, usize, Vector3<f64>)> = (positions.iter().enumerate())
             .filter_map(|(index, &(drive, position))| Some((index, drive, position?)))
@@ -288,8 +285,8 @@ impl MapMaking<'_> {
         plan: &Plan,
     ) -> Result<(SceneSummary, RunConfig)> {
         // Above 0 however long the preparation took: a negative duration would panic.
-        let left_s =
-            (self.config.time.as_secs_f64() - self.seconds() - plan.after_training_s()).max(1.0);
+        let training_end_s = self.config.time.as_secs_f64() - plan.after_training_s();
+        let left_s = (training_end_s - self.seconds()).max(1.0);
         let mut run = self.config.run.clone();
         run.length = Length::Time(Duration::from_secs_f64(left_s));
         run.batch = (plan.training * plan.copies * CELLS / BATCHES).clamp(LEAST_BATCH, MOST_BATCH);
@@ -317,7 +314,6 @@ impl MapMaking<'_> {
         };
         let started = self.started;
         let observe = &mut *self.observe;
-        let training_end_s = self.config.time.as_secs_f64() - plan.after_training_s();
         let mut steps_began_s = None;
         let summary = train_scene_on(&config, training, None, &mut |progress| {
             let mut seconds = started.elapsed().as_secs_f64();

@@ -117,17 +117,14 @@ impl PlaceReport {
     /// The limits of the head, in sentences.
     pub fn limits_text(&self) -> String {
         let roads = "Roads that were not driven give no pose: drive every road, and both directions of wide ones.";
-        let limits = [self.training_limit(), self.confidence_limit()];
+        let error_m = self.cell_error_m;
+        let error_m = error_m.filter(|error_m| *error_m > SHORT_TRAINING_M);
+        let training = error_m.map(|error_m| {
+            format!("The training was too short, the cells of its own sweeps are {error_m:.0} m off: more --minutes.")
+        });
+        let limits = [training, self.confidence_limit()];
         let limits = limits.into_iter().flatten();
         limits.fold(roads.to_owned(), |text, limit| text + " " + &limit)
-    }
-
-    fn training_limit(&self) -> Option<String> {
-        let error_m = self.cell_error_m;
-        let error_m = error_m.filter(|error_m| *error_m > SHORT_TRAINING_M)?;
-        Some(format!(
-            "The training was too short, the cells of its own sweeps are {error_m:.0} m off: more --minutes."
-        ))
     }
 
     fn confidence_limit(&self) -> Option<String> {

@@ -3,6 +3,7 @@
 
 use std::ops::Range;
 
+use nalgebra::Vector3;
 use perception::tensor_values::tensor;
 use serde::Serialize;
 use tch::nn::{self, Init, LinearConfig, Module};
@@ -43,12 +44,12 @@ impl Contrast {
     /// Layers below `path`, for an encoder of `local_channels`.
     pub(super) fn new(path: &nn::Path<'_>, local_channels: i64) -> Self {
         let usual = LinearConfig::default();
-        let near_zero = Init::Randn {
-            mean: 0.0,
-            stdev: 1e-3,
-        };
+        // Near zero at first.
         let last = LinearConfig {
-            ws_init: near_zero,
+            ws_init: Init::Randn {
+                mean: 0.0,
+                stdev: 1e-3,
+            },
             ..usual
         };
         let offset = path / "offset";
@@ -113,17 +114,14 @@ impl Contrast {
         pairs: &[Pair],
         device: Device,
     ) -> Result<Tensor, TchError> {
-        let (mut turns, mut targets) = (Vec::new(), Vec::new());
+        let (mut turns, mut targets) = (Vec::new(), Vec::<f32>::new());
         for pair in pairs {
             let (sin, cos) = (pair.relative_yaw_rad as f32).sin_cos();
-            let rotation = &pair.anchor.sensor_from_world;
             for (anchor, &partner) in pair.anchor.places_m.iter().zip(&pair.matches) {
-                let partner = pair.partner.places_m[partner];
-                let offset: [f32; 3] = std::array::from_fn(|axis| partner[axis] - anchor[axis]);
+                let partner = Vector3::from(pair.partner.places_m[partner]);
                 // Into the frame of the anchor's sensor, the only one that its features know.
-                for row in rotation.as_chunks::<3>().0 {
-                    targets.push((0..3).map(|axis| row[axis] * offset[axis]).sum::<f32>());
-                }
+                let offset = pair.anchor.sensor_from_world * (partner - Vector3::from(*anchor));
+                targets.extend(offset.iter());
                 turns.extend([cos, sin]);
             }
         }

@@ -103,13 +103,12 @@ impl FeatureCache {
         let size = [(total * CELLS) as i64, encoder.format().cell_channels()];
         let cells = Tensor::f_empty(size, (Kind::Half, device))?;
         let mut builder = CacheBuilder::default();
-        let mut done = 0;
-        while done < total {
+        for done in (0..total).step_by(BATCH as usize) {
             let batch = loader.next_batch()?;
             if !batch.is_empty() {
                 builder.add(&cells, &batch, encoder, run.precision.kind())?;
             }
-            done = (done + BATCH as usize).min(total);
+            let done = (done + BATCH as usize).min(total);
             observe(&TrainingEvent::Encoding(done, total));
         }
         let cache = builder.finish(cells)?;

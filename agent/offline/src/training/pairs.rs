@@ -4,7 +4,7 @@ use std::collections::HashMap;
 use std::f64::consts::PI;
 use std::sync::Arc;
 
-use nalgebra::{Isometry3, Point3};
+use nalgebra::{Isometry3, Point3, Rotation3};
 use rand::seq::{IndexedRandom, SliceRandom};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -40,8 +40,8 @@ pub(crate) struct ChosenCells {
     pub rows: Vec<usize>,
     /// `[n]`: positions, metres in the world of the pair (its origin near the sensors).
     pub places_m: Vec<[f32; 3]>,
-    /// Rotation part of `sensor_from_world`, row-major.
-    pub sensor_from_world: [f32; 9],
+    /// Rotation part of `sensor_from_world`.
+    pub sensor_from_world: Rotation3<f32>,
 }
 
 /// Two sweeps of the same place.
@@ -179,15 +179,12 @@ fn chosen(
     world_from_sensor: &Isometry3<f64>,
 ) -> ChosenCells {
     let places_m = rows.iter().map(|&row| places_m[row]).collect();
-    let rotation = world_from_sensor.rotation.inverse().to_rotation_matrix();
-    let rotation = rotation.into_inner().transpose();
-    // Column-major storage of the transpose is row-major storage of the matrix.
-    let sensor_from_world = std::array::from_fn(|place| rotation.as_slice()[place] as f32);
+    let sensor_from_world = world_from_sensor.rotation.inverse().to_rotation_matrix();
     ChosenCells {
         sweep,
         rows,
         places_m,
-        sensor_from_world,
+        sensor_from_world: sensor_from_world.cast(),
     }
 }
 
@@ -206,7 +203,7 @@ pub(super) fn choose(cells: &[SweepCell], count: usize, rng: &mut impl Rng) -> V
 fn places(cells: &[SweepCell], world_from_sensor: &Isometry3<f64>) -> Vec<[f32; 3]> {
     let places = cells.iter().map(|cell| {
         let point = world_from_sensor * Point3::from(cell.centroid_m.map(f64::from));
-        [point.x as f32, point.y as f32, point.z as f32]
+        point.cast::<f32>().into()
     });
     places.collect()
 }

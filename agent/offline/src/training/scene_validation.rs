@@ -13,7 +13,7 @@ use localization::pgc::pose_refinement::SweepCells;
 use localization::pgc::pose_search::PoseSearch;
 use localization::pgc::pose_solver::PoseSolver;
 use localization::pgc::{SceneCoordinates, SceneHead, stopwatch};
-use perception::tensor_values::{tensor, values};
+use perception::tensor_values::values;
 use protocol::PoseError;
 
 /// Errors on sweeps that were not trained on.
@@ -42,7 +42,7 @@ impl fmt::Display for SceneAccuracy {
     }
 }
 
-/// Regresses and solves every sweep of `cache`.
+/// Regresses and solves every sweep of `cache`, whose targets are relative to the origin of the head.
 pub(super) fn validate(
     head: &SceneHead,
     cache: &FeatureCache,
@@ -53,11 +53,7 @@ pub(super) fn validate(
         let of_cells = logits.f_index_select(0, &cache.sweep_of_cell)?;
         head.regress(&head.normalise(&cache.cells)?, &of_cells, kind)
     })?;
-    // Coordinates are relative to the origin of the head's scene.
-    let origin_m = head.config().origin_m;
-    let moved = [0, 1, 2].map(|axis| (cache.origin_m[axis] - origin_m[axis]) as f32);
-    let targets = &cache.targets_m + tensor(&moved, &[3], cache.targets_m.device())?;
-    let error = (&regression.coordinates_m - targets).f_abs()?;
+    let error = (&regression.coordinates_m - &cache.targets_m).f_abs()?;
     let error = error.f_sum_dim_intlist(1_i64, false, Kind::Float)?;
     let cell_errors: Vec<f64> = Vec::try_from(&error.f_to_kind(Kind::Double)?)?;
     let world = values(&regression.coordinates_m)?;
@@ -75,7 +71,7 @@ pub(super) fn validate(
             sensor_m: sensor.as_chunks().0[rows.clone()].to_vec(),
             world_m: world.as_chunks().0[rows.clone()].to_vec(),
             epsilon_m: epsilon[rows].to_vec(),
-            origin_m,
+            origin_m: cache.origin_m,
         };
         let refinement_cells = SweepCells {
             features,

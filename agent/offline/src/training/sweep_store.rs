@@ -71,11 +71,8 @@ pub(super) fn heading_rad(world_from_sensor: &Isometry3<f64>) -> f64 {
 
 /// Mean position of sensors, metres, world frame.
 pub(super) fn mean_position_m(world_from_sensor: &[Isometry3<f64>]) -> [f64; 3] {
-    std::array::from_fn(|axis| {
-        let poses = world_from_sensor.iter();
-        let positions = poses.map(|pose| pose.translation.vector[axis]);
-        positions.sum::<f64>() / world_from_sensor.len() as f64
-    })
+    let positions = world_from_sensor.iter().map(|pose| pose.translation.vector);
+    (positions.sum::<Vector3<f64>>() / world_from_sensor.len() as f64).into()
 }
 
 /// Paths of sweeps with true poses on disk. Each folder is one world: poses in different folders are unrelated.
@@ -160,15 +157,15 @@ impl SweepList {
         }
     }
 
-    /// Drive of each sweep, and its pose without reading points; `None` for a sweep without one.
-    pub(crate) fn poses(&self) -> Vec<(usize, Option<Isometry3<f64>>)> {
+    /// Drive of each sweep, and its position without reading points, metres; `None` for a sweep without a pose.
+    pub(crate) fn positions(&self) -> Vec<(usize, Option<Vector3<f64>>)> {
         let options = LoadOptions::without_points();
-        let poses = self.places.iter().enumerate().map(|(index, place)| {
+        let positions = self.places.iter().enumerate().map(|(index, place)| {
             let frame = self.load(index, place, &options);
             let pose = frame.and_then(|frame| frame.world_from_lidar);
-            (place.drive, pose.map(|pose| pose.isometry()))
+            (place.drive, pose.map(|pose| pose.translation_m.into()))
         });
-        poses.collect()
+        positions.collect()
     }
 
     /// Reads the whole frame of a sweep, with the names of its scenario and its files; `None` if it cannot be read.

@@ -4,15 +4,10 @@ use protocol::Box3d;
 
 use crate::boxes::anchors::Anchors;
 
-/// The output of a head does not fit its anchors.
+/// The output of a head does not fit its anchors: name and values of the output, number of anchors, values needed.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("head output {field} has {found} values, {anchors} anchors need {expected}")]
-pub struct DecodeError {
-    field: &'static str,
-    found: usize,
-    anchors: usize,
-    expected: usize,
-}
+#[error("head output {0} has {1} values, {2} anchors need {3}")]
+pub struct DecodeError(&'static str, usize, usize, usize);
 
 /// A decoded box of one anchor.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -49,12 +44,7 @@ pub fn decode(
     for (field, found, of_anchor) in [("scores", scores.len(), 1), ("offsets", offsets.len(), 7)] {
         let (anchors, expected) = (anchors.len(), anchors.len() * of_anchor);
         if found != expected {
-            return Err(DecodeError {
-                field,
-                found,
-                anchors,
-                expected,
-            });
+            return Err(DecodeError(field, found, anchors, expected));
         }
     }
     let per_cell = anchors.yaws_rad.len();

@@ -8,6 +8,7 @@ use crate::int8::{ActivationScales, Quantisation, QuantiseError, ScaleSearch};
 use crate::layers::backbone::BevBackbone;
 use crate::layers::shrink::Shrink;
 use crate::pillars::batch::PillarGrid;
+use crate::pillars::point_pillars::PointPillars;
 use crate::pillars::projection::PillarProjection;
 use crate::pillars::voxels::Pillars;
 
@@ -37,23 +38,18 @@ enum Layers {
 }
 
 impl BevEncoder {
-    /// An encoder of folded layers in floating point.
-    pub(super) fn new(
-        pillar_grid: PillarGrid,
-        projection: PillarProjection,
-        backbone: BevBackbone,
-        shrink: Shrink,
-        device: Device,
-    ) -> Self {
-        let canvas = vec![0.0; canvas_len(&pillar_grid, &projection)];
+    /// The encoder of a network, its layers folded, in floating point.
+    pub(super) fn new(network: &PointPillars) -> Self {
+        let projection = PillarProjection::new(&network.encoder);
+        let canvas = vec![0.0; canvas_len(&network.pillar_grid, &projection)];
         Self {
-            pillar_grid,
+            pillar_grid: network.pillar_grid,
             projection,
-            device,
+            device: network.device(),
             layers: Layers::Float {
                 canvas,
-                backbone,
-                shrink,
+                backbone: network.backbone.folded(),
+                shrink: network.shrink.folded(),
             },
         }
     }
@@ -144,5 +140,5 @@ impl BevEncoder {
 }
 
 fn canvas_len(pillar_grid: &PillarGrid, projection: &PillarProjection) -> usize {
-    pillar_grid.width * pillar_grid.height * projection.channels()
+    pillar_grid.width * pillar_grid.height * projection.channels
 }

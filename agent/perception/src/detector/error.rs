@@ -23,16 +23,9 @@ pub enum DetectorError {
     /// The vehicle has no detector.
     #[error("this vehicle has no detector: it gives poses only")]
     Absent,
-    /// A feature map does not have the shape of this detector's.
-    #[error("{what} is {found:?}, this detector's is {expected:?} (channels, height, width)")]
-    Shape {
-        /// Name of the feature map.
-        what: &'static str,
-        /// Its shape.
-        found: Vec<i64>,
-        /// The shape of this detector's.
-        expected: [i64; 3],
-    },
+    /// A feature map, by its name, has a shape other than that of this detector's, which follows it.
+    #[error("{0} is {1:?}, this detector's is {2:?} (channels, height, width)")]
+    Shape(&'static str, Vec<i64>, [i64; 3]),
     /// A sweep has no point that the detector could use: a blind sensor, or coordinates of another frame or unit.
     #[error(
         "none of the {points} points of the sweep lies in the area of the detector, {area_m:?} m (x, y, z low, then high)"

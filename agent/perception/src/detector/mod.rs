@@ -31,7 +31,6 @@ use crate::layers::head::{DetectionHead, HeadOutput};
 use crate::layers::shrink::Compressor;
 use crate::model_config::{DetectorConfig, YAxis};
 use crate::pillars::point_pillars::PointPillars;
-use crate::pillars::projection::PillarProjection;
 use crate::pillars::voxels::{Pillars, Voxeliser};
 use crate::tensor_values::{tensor, values};
 use crate::weights::Weights;
@@ -122,13 +121,7 @@ impl Detector {
             device: network.device(),
             crop: Crop::for_detector(&network.config),
             voxeliser: Voxeliser::for_detector(&network.config),
-            encoder: BevEncoder::new(
-                network.pillar_grid,
-                PillarProjection::new(&network.encoder),
-                network.backbone.folded(),
-                network.shrink.folded(),
-                network.device(),
-            ),
+            encoder: BevEncoder::new(&network),
             compressor: network.compressor.as_ref().map(Compressor::folded),
             anchors: Anchors::for_detector(&network.config),
             head: network.head,
@@ -333,11 +326,8 @@ impl Detector {
         let [expected, height, width] = self.sent_shape();
         let found = [channels, grid.height, grid.width].map(i64::from);
         if found != self.sent_shape() || values.len() as i64 != expected * height * width {
-            return Err(DetectorError::Shape {
-                what: "feature map of a message",
-                found: found.into(),
-                expected: self.sent_shape(),
-            });
+            let what = "feature map of a message";
+            return Err(DetectorError::Shape(what, found.into(), self.sent_shape()));
         }
         let code = tensor(values, &[1, expected, height, width], self.device)?;
         let decompressed = self.decompressed(&code)?;
@@ -445,11 +435,7 @@ fn checked(features: &Tensor, expected: [i64; 3]) -> Result<Tensor> {
         return Ok(features.f_unsqueeze(0)?);
     }
     if found.split_first() != Some((&1, expected.as_slice())) {
-        return Err(DetectorError::Shape {
-            what: "feature map",
-            found,
-            expected,
-        });
+        return Err(DetectorError::Shape("feature map", found, expected));
     }
     Ok(features.shallow_clone())
 }
@@ -650,7 +636,7 @@ mod tests {
         let other = Tensor::zeros([1, 64, 8, 8], (Kind::Float, Device::Cpu));
         assert!(matches!(
             detector.through_compressor(&other),
-            Err(DetectorError::Shape { .. })
+            Err(DetectorError::Shape(..))
         ));
         let plain = Detector::from_network(network().1);
         assert!(

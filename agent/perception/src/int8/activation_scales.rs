@@ -23,13 +23,9 @@ impl ActivationScales {
     /// # Errors
     /// [`QuantiseError::Scale`] if it was not observed.
     pub fn get(&self, name: &str) -> Result<Quantisation, QuantiseError> {
-        self.0
-            .get(name)
-            .copied()
-            .ok_or_else(|| QuantiseError::Scale {
-                name: name.to_owned(),
-                known: self.0.keys().cloned().collect(),
-            })
+        let known = || self.0.keys().cloned().collect();
+        let scale = self.0.get(name).copied();
+        scale.ok_or_else(|| QuantiseError::Scale(name.to_owned(), known()))
     }
 
     /// SHA-256 over the scales of the activations whose name is `wanted`.

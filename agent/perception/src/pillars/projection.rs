@@ -17,7 +17,8 @@ const LANES: usize = 16;
 /// pillar's centre, so that no precision is lost 100 m away from the sensor.
 #[derive(Debug, Clone)]
 pub struct PillarProjection {
-    channels: usize,
+    /// Channels per pillar `C`.
+    pub channels: usize,
     /// `[C / LANES]`: weights of x, y, z (relative to the centre) and intensity, per lane.
     point: Vec<[[f32; LANES]; 4]>,
     /// `[C / LANES]`: weights of the mean's offset from the centre.
@@ -64,11 +65,6 @@ impl PillarProjection {
             center: center.collect(),
             bias: bias.as_chunks().0.to_vec(),
         }
-    }
-
-    /// Channels per pillar `C`.
-    pub fn channels(&self) -> usize {
-        self.channels
     }
 
     /// Writes the features of every pillar to `canvas`, `[H, W, C]` row-major, which the caller has zeroed.

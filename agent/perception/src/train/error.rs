@@ -15,16 +15,10 @@ pub enum TrainingError {
     /// A file cannot be read, written or used.
     #[error(transparent)]
     File(#[from] FileError),
-    /// The checkpoint is of another training.
-    #[error("the checkpoint was made with {field} {found}, not {asked}")]
-    OtherTraining {
-        /// Name of the field that differs.
-        field: &'static str,
-        /// Value in the checkpoint.
-        found: String,
-        /// Value on the command line.
-        asked: String,
-    },
+    /// The checkpoint is of another training: name of the field that differs, its value in the checkpoint, and on the
+    /// command line.
+    #[error("the checkpoint was made with {0} {1}, not {2}")]
+    OtherTraining(&'static str, String, String),
     /// The loss has diverged.
     #[error("the gradient was not finite {0} times in a row; try a lower learning rate")]
     Diverged(u32),

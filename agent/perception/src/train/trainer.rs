@@ -53,11 +53,7 @@ impl CheckpointState {
         ];
         match fields.into_iter().find(|(_, found, asked)| found != asked) {
             None => Ok(()),
-            Some((field, found, asked)) => Err(TrainingError::OtherTraining {
-                field,
-                found,
-                asked,
-            }),
+            Some((field, found, asked)) => Err(TrainingError::OtherTraining(field, found, asked)),
         }
     }
 }
@@ -143,11 +139,10 @@ impl Trainer {
     /// [`TrainingError::OtherTraining`] when the checkpoint that is resumed states other data.
     pub fn on_data(mut self, sha256: &str) -> Result<Self, TrainingError> {
         match self.progress.data_sha256.replace(sha256.to_owned()) {
-            Some(found) if found != sha256 => Err(TrainingError::OtherTraining {
-                field: "data of SHA-256",
-                found,
-                asked: sha256.to_owned(),
-            }),
+            Some(found) if found != sha256 => {
+                let (field, asked) = ("data of SHA-256", sha256.to_owned());
+                Err(TrainingError::OtherTraining(field, found, asked))
+            }
             _ => Ok(self),
         }
     }

@@ -151,8 +151,9 @@ impl Weights {
     /// Network of the file's configuration with its parameters, frozen; `build` gets the path of its variables.
     ///
     /// # Errors
-    /// [`FileError`] when the file is of another kind or its tensors are not those of the network, and those of `build`.
-    pub fn network<C: DeserializeOwned, N, E: From<FileError>>(
+    /// [`FileError`] when the file is of another kind, `build` refuses its configuration, or its tensors are not those of
+    /// the network.
+    pub fn network<C: DeserializeOwned, N, E: From<FileError> + Display + 'static>(
         &self,
         kind: &'static str,
         device: Device,
@@ -160,19 +161,21 @@ impl Weights {
     ) -> Result<N, E> {
         self.check_kind(kind)?;
         let mut variables = VarStore::new(device);
-        let network = build(&variables.root(), self.config()?)?;
+        let network = build(&variables.root(), self.config()?).at(&self.path)?;
         self.copy_into(&variables)?;
         variables.freeze();
         Ok(network)
     }
 
-    /// Configuration of a detector.
+    /// Configuration of a detector, from which a network can be built.
     ///
     /// # Errors
-    /// [`FileError`] when the file names another kind of network; see [`Self::metadata_json`].
+    /// [`FileError`] when the file names another kind of network, or a value is out of range; see [`Self::metadata_json`].
     pub fn detector_config(&self) -> Result<DetectorConfig> {
         self.check_kind(DETECTOR_KIND)?;
-        self.config()
+        let config: DetectorConfig = self.config()?;
+        config.validate().at(&self.path)?;
+        Ok(config)
     }
 
     /// The JSON under a metadata key.
@@ -327,6 +330,7 @@ mod tests {
     use tch::Device;
 
     use super::*;
+    use crate::model_config::ConfigError;
     use crate::pillars::point_pillars::PointPillars;
 
     fn small() -> DetectorConfig {
@@ -376,6 +380,24 @@ mod tests {
                 .iter()
                 .all(|(name, tensor)| tensor.equal(&copies[name]))
         );
+    }
+
+    #[test]
+    fn a_configuration_of_no_network_is_named_with_its_file() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("flat.safetensors");
+        let mut config = small();
+        config.anchors.size_lwh_m[0] = -3.9;
+        let nothing = VarStore::new(Device::Cpu);
+        save(&path, &nothing, &metadata(&config), Precision::Single).unwrap();
+        let weights = Weights::load(&path).unwrap();
+        let message = weights.detector_config().unwrap_err().to_string();
+        let reason = "anchors.size_lwh_m is [-3.9, 1.6, 1.56]";
+        assert!(message.contains("flat.safetensors: "), "{message}");
+        assert!(message.contains(reason), "{message}");
+        let build = |_: &nn::Path<'_>, config: DetectorConfig| config.validate();
+        let built: Result<(), ConfigError> = weights.network(DETECTOR_KIND, Device::Cpu, build);
+        assert_eq!(built.unwrap_err().to_string(), message);
     }
 
     #[test]

@@ -74,9 +74,7 @@ impl Amota {
 
 impl OperatingPoint {
     fn of(sequences: &[Sequence], min_score: f64) -> Self {
-        let all = sequences.iter();
-        let kept = all.map(|sequence| sequence.with_min_score(min_score));
-        let kept: Vec<Sequence> = kept.collect();
+        let kept = Sequence::with_min_score(sequences, min_score);
         let counts = ClearMot::of(&kept, MATCH_DISTANCE_M);
         Self { min_score, counts }
     }

@@ -61,9 +61,8 @@ impl TrackQuality {
         let Some(best) = found.best else {
             return averages;
         };
-        let averaged = sequences.iter().map(Sequence::with_mean_scores);
-        let kept = averaged.map(|sequence| sequence.with_min_score(best.min_score));
-        let kept: Vec<Sequence> = kept.collect();
+        let averaged: Vec<Sequence> = sequences.iter().map(Sequence::with_mean_scores).collect();
+        let kept = Sequence::with_min_score(&averaged, best.min_score);
         let hota = Hota::of(&kept);
         Self {
             min_score: Some(best.min_score),

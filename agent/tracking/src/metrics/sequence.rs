@@ -57,10 +57,10 @@ impl Sequence {
         Ok(())
     }
 
-    /// The sequence without track points of a lower score.
-    pub(crate) fn with_min_score(&self, min_score: f64) -> Self {
-        let mut kept = self.clone();
-        for frame in &mut kept.frames {
+    /// The sequences without track points of a lower score.
+    pub(crate) fn with_min_score(sequences: &[Self], min_score: f64) -> Vec<Self> {
+        let mut kept = sequences.to_vec();
+        for frame in kept.iter_mut().flat_map(|sequence| &mut sequence.frames) {
             frame.tracks.retain(|track| track.score >= min_score);
         }
         kept

@@ -13,7 +13,6 @@ use ego_fuser::config::EgoSettings;
 use ego_fuser_offline::evaluation::stepped::ComputeTimes;
 use ego_fuser_offline::evaluation::{EmulatedLink, Setup};
 use fusion::Method;
-use indicatif::ProgressBar;
 use link::{CapacityConfig, LatencyModel};
 use localization::pose_source::PoseSourceConfig;
 use perception::int8::InferencePrecision;
@@ -22,7 +21,7 @@ use protocol::{CodecConfig, Dtype};
 use runner::experiment::evaluation::{OpenedData, Trial, evaluate};
 use runner::experiment::report;
 use runner::experiment::spec::Experiment;
-use runner::experiment::table::{self, TableObserver};
+use runner::experiment::table;
 use support::file_error::FileError;
 use support::output;
 use terminal::progress;
@@ -33,7 +32,7 @@ use super::slices::SliceArgs;
 use support::cli::{BadInput, Outcome};
 
 /// Options and groups of options, beside those of pose sources, that a file of tables states itself.
-const OF_ONE_TABLE: [&str; 20] = [
+const OF_ONE_TABLE: [&str; 21] = [
     "dataset",
     "method",
     "weights",
@@ -43,6 +42,7 @@ const OF_ONE_TABLE: [&str; 20] = [
     "RateConfig",
     "emulation",
     "delay_ms",
+    "max_age_ms",
     "attack",
     "trust",
     "boxes",
@@ -58,7 +58,7 @@ const OF_ONE_TABLE: [&str; 20] = [
 
 #[derive(Debug, clap::Args)]
 #[command(group = ArgGroup::new("emulation").args(["link", "bandwidth_mbps", "latency_ms"]).multiple(true))]
-#[command(group = ArgGroup::new("sliced").args(["slice", "print"]).requires("table"))]
+#[command(group = ArgGroup::new("sliced").args(["slice", "print"]).requires("tables"))]
 pub(crate) struct Arguments {
     /// Data set, split or scenario; its layout is detected. The first vehicle of each scenario is the ego.
     #[arg(long, value_name = "DIR", required_unless_present = "table")]
@@ -74,7 +74,8 @@ pub(crate) struct Arguments {
     #[arg(long, value_enum, default_value_t)]
     precision: InferencePrecision,
     /// Instead: a file of tables, rows of methods and columns of conditions; cells that are done are kept in --out.
-    #[arg(long, value_name = "FILE", requires = "out")]
+    // Required as a group of one option, as is --attack: clap forgets the requirement of an option that another excludes.
+    #[arg(long, value_name = "FILE", group = "tables", requires = "out")]
     #[arg(conflicts_with_all = OF_ONE_TABLE.iter().chain(PoseSourceConfig::OPTION_GROUPS).copied())]
     table: Option<PathBuf>,
     #[command(flatten)]
@@ -113,9 +114,9 @@ pub(crate) struct Arguments {
     /// Longest time that a frame waits for its neighbours, milliseconds (--link) [default: that of ego-fuser run].
     #[arg(long, value_name = "MS", requires = "emulation")]
     deadline_ms: Option<u64>,
-    /// Largest age of a feature map that is still fused, by capture time, milliseconds (--link) [default: that of
-    /// ego-fuser run].
-    #[arg(long, value_name = "MS", requires = "emulation")]
+    /// Largest age of a feature map that is still fused, by capture time and beyond --delay-ms, milliseconds [default: that
+    /// of ego-fuser run].
+    #[arg(long, value_name = "MS")]
     max_age_ms: Option<u64>,
     /// Compute time of pose, map and fusion, milliseconds, for example 20,60,30; without it no latency is reported
     /// (--link).
@@ -123,13 +124,13 @@ pub(crate) struct Arguments {
     #[arg(default_value = "0,0,0", requires = "emulation")]
     compute_ms: Vec<f64>,
     /// Attack by neighbours: falsified messages, to measure their effect on the ego.
-    #[arg(long, value_enum, value_name = "ATTACK")]
+    #[arg(long, value_enum, value_name = "ATTACK", group = "attacked")]
     attack: Option<Falsification>,
     /// Number of attackers, the first neighbours of every scenario (--attack).
-    #[arg(long, default_value_t = 1, requires = "attack")]
+    #[arg(long, default_value_t = 1, requires = "attacked")]
     attackers: usize,
     /// Seed of the falsified messages (--attack).
-    #[arg(long, default_value_t = 0, requires = "attack")]
+    #[arg(long, default_value_t = 0, requires = "attacked")]
     attack_seed: u64,
     /// Misbehaviour detection: excludes neighbours whose messages contradict the ego's own detections.
     #[arg(long)]
@@ -161,10 +162,6 @@ pub(crate) struct Arguments {
     json: bool,
 }
 
-fn at_most(count: u64) -> usize {
-    usize::try_from(count).unwrap_or(usize::MAX)
-}
-
 impl Arguments {
     /// Evaluates every method and prints the metrics.
     pub(crate) fn run(self) -> anyhow::Result<Outcome> {
@@ -177,6 +174,8 @@ impl Arguments {
         let trial = self.trial()?;
         let data = OpenedData::open(&trial).map_err(BadInput::of)?;
         trial.check_participants(&data).map_err(BadInput::of)?;
+        let lacking = data.lacking(trial.scenarios, trial.setup.frames);
+        lacking.into_iter().for_each(output::note);
         // Before the first is evaluated: weights that are wrong must not cost the results of others.
         for &method in &self.method {
             trial.evaluator(&data, method).map_err(BadInput::of)?;
@@ -213,11 +212,15 @@ impl Arguments {
             let reason = "--watch-queue: without --link there is no queue to watch";
             return Err(BadInput::new(reason));
         }
+        let mut methods = self.method.iter().enumerate();
+        if let Some((_, twice)) = methods.find(|(place, one)| self.method[..*place].contains(one)) {
+            return Err(BadInput::new(format!("--method names {twice} twice")));
+        }
         let intensity_scale = self.intensity.scale;
         let trial = Trial {
             // Required unless --table is given, which does not come here.
             dataset: self.dataset.clone().unwrap_or_default(),
-            scenarios: self.scenarios.map(at_most),
+            scenarios: self.scenarios.map(|count| count as usize),
             intensity_scale,
             protocol: self.protocol.clone(),
             setup: Setup {
@@ -243,7 +246,7 @@ impl Arguments {
                 link: self.emulates_link().then(|| self.link()).transpose()?,
                 delay_ms: self.delay_ms,
                 compute: self.compute()?,
-                frames: self.frames.map(at_most),
+                frames: self.frames.map(|count| count as usize),
                 ..Setup::default()
             },
             maps: self.feature_maps.as_ref().map(|folder| KeptMaps {
@@ -322,11 +325,20 @@ fn tables(file: &Path, out: &Path, slices: &SliceArgs) -> anyhow::Result<Outcome
         return Ok(Outcome::Done);
     }
     let slice = slices.slice()?;
-    let mut progress = TableProgress(progress::spinner("frames"));
-    let filled = table::run(&experiment, out, slice, &mut progress)
+    let bar = progress::spinner("frames");
+    // Shows which cell is computed; without a terminal, where the spinner shows nothing, on a line of its own.
+    let mut on_cell = |cell: &str, known: bool| {
+        let known = if known { ", known" } else { "" };
+        let text = format!("{cell}{known}");
+        if bar.is_hidden() {
+            output::note(&text);
+        }
+        bar.set_message(text);
+    };
+    let filled = table::run(&experiment, out, slice, &mut on_cell, &mut || bar.tick())
         .with_context(|| file.display().to_string())
         .map_err(BadInput::of)?;
-    progress.0.finish_and_clear();
+    bar.finish_and_clear();
     if let Some(slice) = slice {
         output::note(format_args!(
             "slice {slice} is computed; without --slice, this command writes the tables"
@@ -336,25 +348,6 @@ fn tables(file: &Path, out: &Path, slices: &SliceArgs) -> anyhow::Result<Outcome
         output::line(table::markdown(table))?;
     }
     let rows = filled.iter().flat_map(|table| &table.rows);
-    let cells = rows.flat_map(|row| row.cells.iter().flatten());
+    let cells = rows.flat_map(|(_, cells)| cells.iter().flatten());
     Ok(left_out(cells.map(|cell| &cell.metrics.left_out)))
-}
-
-/// Shows on standard error which cell is computed.
-struct TableProgress(ProgressBar);
-
-impl TableObserver for TableProgress {
-    fn cell(&mut self, table: &str, row: &str, column: &str, known: bool) {
-        let known = if known { ", known" } else { "" };
-        let text = format!("{table}: {row}, {column}{known}");
-        // Without a terminal the spinner shows nothing, so each cell gets a line of its own.
-        if self.0.is_hidden() {
-            output::note(&text);
-        }
-        self.0.set_message(text);
-    }
-
-    fn frame(&mut self) {
-        self.0.tick();
-    }
 }

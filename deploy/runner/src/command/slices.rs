@@ -12,10 +12,11 @@ pub(crate) struct SliceArgs {
     #[arg(long, value_name = "M/N", conflicts_with = "print")]
     slice: Option<Slice>,
     /// Print the file with which an engine runs all slices and then this command; nothing is computed.
-    #[arg(long, value_enum, value_name = "ENGINE", requires = "slices")]
+    #[arg(long, value_enum, value_name = "ENGINE")]
+    #[arg(group = "printed", requires = "slices")]
     print: Option<Engine>,
     /// Number of slices (--print).
-    #[arg(long, value_name = "N", requires = "print", value_parser = clap::value_parser!(u16).range(1..=10_000))]
+    #[arg(long, value_name = "N", requires = "printed", value_parser = clap::value_parser!(u16).range(1..=10_000))]
     slices: Option<u16>,
 }
 

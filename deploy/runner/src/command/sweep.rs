@@ -71,10 +71,10 @@ impl Arguments {
             ));
             return Ok(Outcome::Done);
         }
-        let computed = sweep.run(jobs, self.keep_feature_maps).map_err(blamed)?;
+        let (table, runs) = sweep.run(jobs, self.keep_feature_maps).map_err(blamed)?;
         match self.json {
-            true => output::line(serde_json::to_string_pretty(&computed.runs)?)?,
-            false => output::text(&computed.table)?,
+            true => output::line(serde_json::to_string_pretty(&runs)?)?,
+            false => output::text(&table)?,
         }
         // Prints how much space the feature maps take.
         let maps = out.join("maps");
@@ -88,8 +88,7 @@ impl Arguments {
             ));
         }
         output::note(format_args!("all columns and the report: {folder}"));
-        let runs = computed.runs.iter();
-        Ok(left_out(runs.map(|run| &run.cell.metrics.left_out)))
+        Ok(left_out(runs.iter().map(|run| &run.cell.metrics.left_out)))
     }
 }
 

@@ -2,11 +2,10 @@
 
 use std::path::PathBuf;
 
-use agent::config::AgentSettings;
 use fusion::Method;
-use protocol::{CodecConfig, RunId};
-use runner::experiment::evaluation::Trial;
+use protocol::RunId;
 use runner::experiment::report;
+use runner::experiment::without_effect::without_effect;
 use runner::run::run_fleet::{RunOptions, run_scenario};
 use runner::scenario::{FieldOverride, Scenario};
 use support::output;
@@ -75,12 +74,11 @@ impl Arguments {
             programs: programs()?,
             prefix: "up",
         };
-        note_without_effect(&scenario);
+        without_effect(&scenario).into_iter().for_each(output::note);
         let result = run_scenario(&scenario, &options)?;
-        let (asked, ticks) = (scenario.scene.frames, result.metrics.ticks);
-        if let Some(asked) = asked.filter(|asked| *asked as u64 > ticks && !scenario.scene.repeat) {
-            output::note(format_args!("{ticks} of {asked} frames were played"));
-        }
+        let asked = scenario.scene.frames.filter(|_| !scenario.scene.repeat);
+        let fewer = report::fewer_frames(result.metrics.ticks as usize, asked);
+        fewer.into_iter().for_each(output::note);
         if self.json {
             output::line(serde_json::to_string_pretty(&result.metrics)?)?;
         } else {
@@ -91,18 +89,5 @@ impl Arguments {
         }
         report::print_loss(&result, false);
         Ok(Outcome::of(result.lost_data()))
-    }
-}
-
-/// Names a setting that has no effect with the method of the run. The format of maps may stand there for other methods.
-fn note_without_effect(scenario: &Scenario) {
-    let mut trial = Trial::default();
-    trial.setup.ego = scenario.ego.clone();
-    trial.setup.agents = AgentSettings {
-        codec: CodecConfig::default(),
-        ..scenario.agents.clone()
-    };
-    if let Err(problem) = trial.check(&[scenario.method]) {
-        output::note(format_args!("without effect: {problem}"));
     }
 }

@@ -2,18 +2,22 @@
 
 use std::collections::BTreeSet;
 use std::io;
+use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result};
-use deploy::score::metrics::{Messages, Metrics};
+use deploy::score::metrics::{ByIou, Messages, Metrics};
 use fusion::Method;
 use serde::{Deserialize, Serialize};
 use support::atomic_file;
 use support::bounded_file::{self, MAX_TEXT_BYTES};
+use support::output;
 use support::provenance::Provenance;
 
 /// Digits of the key in the name of a file.
 const NAME_DIGITS: usize = 24;
+/// Average precisions, with room for the rounding of a sum of shares.
+const PRECISIONS: RangeInclusive<f64> = -1e-6..=1.0 + 1e-6;
 
 /// Identity of a result.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -51,10 +55,10 @@ impl CellKey {
 }
 
 impl Cell {
-    /// The cached cell; `None` if it does not exist.
+    /// The cached cell; `None` if it does not exist. A file that is no cell is named and counts as missing.
     ///
     /// # Errors
-    /// An error when the file cannot be read or is no cached cell.
+    /// An error when the file cannot be read.
     pub fn read(key: &CellKey, folder: &Path) -> Result<Option<Self>> {
         let path = key.file(folder);
         let text = match bounded_file::read_text(&path, MAX_TEXT_BYTES) {
@@ -62,12 +66,22 @@ impl Cell {
             Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
             Err(error) => return Err(error).with_context(|| path.display().to_string()),
         };
-        let cell: Self = serde_json::from_str(&text).with_context(|| {
+        let cell = serde_json::from_str(&text)
+            .ok()
+            .filter(Self::has_precisions);
+        if cell.is_none() {
             let path = path.display();
-            format!("{path}: malformed; without the file it is computed anew")
-        })?;
+            output::note(format_args!("{path}: malformed, counts as missing"));
+        }
         // Another key with the same first digits is no hit.
-        Ok((cell.key.sha256 == key.sha256).then_some(cell))
+        Ok(cell.filter(|cell| cell.key.sha256 == key.sha256))
+    }
+
+    /// False where a precision is outside 0 to 1.
+    fn has_precisions(&self) -> bool {
+        let orders = [self.metrics.ap_global, self.metrics.ap_frame_order];
+        let mut all = orders.iter().flat_map(ByIou::values).flatten();
+        all.all(|precision| PRECISIONS.contains(&precision))
     }
 
     /// Caches the cell; the file appears only when it is complete.
@@ -134,9 +148,16 @@ mod tests {
         let cached = Cell::read(&cell.key, folder.path()).unwrap();
         assert_eq!(cached.as_ref(), Some(&cell));
         assert_eq!(Cell::read(&key("0b"), folder.path()).unwrap(), None);
-        fs::write(cell.key.file(folder.path()), "{").unwrap();
-        let error = Cell::read(&cell.key, folder.path()).unwrap_err();
-        let message = error.to_string();
-        assert!(message.contains("script-fusion-mine.pt-0a0a"), "{message}");
+        let mut wrong = cell.clone();
+        wrong.metrics.ap_global.at_50 = Some(1.5);
+        let file = cell.key.file(folder.path());
+        assert!(file.ends_with("script-fusion-mine.pt-0a0a0a0a0a0a0a0a0a0a0a0a.json"));
+        let text = fs::read_to_string(&file).unwrap();
+        let wrong = serde_json::to_string(&wrong).unwrap();
+        // Torn, empty, and with an impossible precision.
+        for text in [&text[..300], "", wrong.as_str()] {
+            fs::write(&file, text).unwrap();
+            assert_eq!(Cell::read(&cell.key, folder.path()).unwrap(), None);
+        }
     }
 }

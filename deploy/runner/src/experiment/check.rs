@@ -3,7 +3,6 @@
 use std::fmt::Debug;
 
 use anyhow::{Result, anyhow, bail, ensure};
-use bus::InboxConfig;
 use ego_fuser::config::EgoSettings;
 use ego_fuser_offline::evaluation::stepped::ComputeTimes;
 use fusion::{Exchange, Method};
@@ -64,10 +63,13 @@ fn check_used(experiment: &Experiment) -> Result<()> {
     if let Some(ego) = &ego.id {
         bail!("ego.id is {ego}: choose by protocol.ego_kind instead");
     }
-    ensure!(
-        ego.inbox == InboxConfig::default(),
-        "ego.inbox is given, but receive limits do not apply in simulation time"
-    );
+    for (field, is_unset) in [
+        ("inbox", ego.inbox == unset.inbox),
+        ("pace", ego.pace == unset.pace),
+        ("tracks", ego.tracks == unset.tracks),
+    ] {
+        ensure!(is_unset, "ego.{field} has no effect in an experiment");
+    }
     let (mode, has_axis) = (experiment.noise_mode, experiment.grid.pose_noise.is_some());
     ensure!(
         mode == NoiseMode::default() || (has_axis && mode != NoiseMode::Replayed),
@@ -79,15 +81,11 @@ fn check_used(experiment: &Experiment) -> Result<()> {
         is_timed || experiment.compute == ComputeTimes::default(),
         "compute is given, but without link no time passes"
     );
-    for (field, value_ms, unset_ms) in [
-        ("deadline_ms", ego.deadline_ms, unset.deadline_ms),
-        ("max_age_ms", ego.max_age_ms, unset.max_age_ms),
-    ] {
-        ensure!(
-            is_timed || value_ms == unset_ms,
-            "ego.{field} is {value_ms}, but without link no time passes"
-        );
-    }
+    let deadline_ms = ego.deadline_ms;
+    ensure!(
+        is_timed || deadline_ms == unset.deadline_ms,
+        "ego.deadline_ms is {deadline_ms}, but without link no time passes"
+    );
     Ok(())
 }
 
@@ -115,7 +113,7 @@ fn tables(experiment: &Experiment) -> Result<()> {
     Ok(())
 }
 
-/// Refuses names that stand twice or divide a table, and trainings that are one file.
+/// Refuses names that stand twice or divide a table.
 fn check_names(table: &Table) -> Result<()> {
     let (name, rows) = (&table.name, &table.rows);
     let columns = table.columns.iter().map(|column| column.name.clone());
@@ -128,10 +126,6 @@ fn check_names(table: &Table) -> Result<()> {
             ensure!(is_plain(name), "{field}: {name:?} has | or a line end");
             Ok(())
         })?;
-    }
-    for row in rows.iter().filter(|row| !row.weights.is_empty()) {
-        let field = format!("table {name:?}, row {}: weights", row.label());
-        values(&field, Some(&row.weights), |_| Ok(()))?;
     }
     Ok(())
 }
@@ -178,15 +172,9 @@ fn axes(grid: &Grid) -> Result<()> {
     values("grid.codec", grid.codec.as_ref(), codec)?;
     numbers("grid.latency_ms", &grid.latency_ms, 0.0, 600_000.0)?;
     numbers("grid.jitter_ms", &grid.jitter_ms, 0.0, 600_000.0)?;
-    values(
-        "grid.bandwidth_mbps",
-        grid.bandwidth_mbps.as_ref(),
-        |mbps| match *mbps {
-            // Infinity stands for an unlimited link and is in no range of numbers.
-            f64::INFINITY => Ok(()),
-            mbps => number("grid.bandwidth_mbps", mbps, 1e-6, 1e6),
-        },
-    )?;
+    // Infinity stands for an unlimited link; the highest rate of a limited one is the link's own rule.
+    let unlimited = f64::INFINITY;
+    numbers("grid.bandwidth_mbps", &grid.bandwidth_mbps, 1e-6, unlimited)?;
     numbers("grid.loss", &grid.loss, 0.0, 1.0)?;
     values("grid.pose_noise", grid.pose_noise.as_ref(), |noise| {
         let (position_m, heading_deg) = (noise.position_std_m, noise.heading_std_deg);
@@ -200,10 +188,8 @@ fn axes(grid: &Grid) -> Result<()> {
 }
 
 fn codec(codec: &CodecSpec) -> Result<()> {
-    // Written as a negation, so that NaN is refused too.
-    if let Some(keep) = codec.keep.filter(|keep| !(*keep > 0.0 && *keep <= 1.0)) {
-        bail!("grid.codec: keep is {keep}, must be above 0 and at most 1");
-    }
+    // The smallest is less than a cell of any map, of which one is always sent.
+    number("grid.codec: keep", codec.keep.unwrap_or(1.0), 1e-6, 1.0)?;
     number("grid.codec: fit", codec.fit.unwrap_or(1.0), 0.01, 1.0)?;
     let level = f64::from(codec.zstd_level.unwrap_or(1));
     number("grid.codec: zstd_level", level, 1.0, 22.0)
@@ -234,17 +220,27 @@ fn contradictions(experiment: &Experiment, link: &LinkConfig) -> Result<()> {
         "grid.pose_noise is added to recorded poses, but poses is {}",
         poses.name()
     );
-    if grid.codec.is_some() && exchanges.clone().all(|it| it != Exchange::Features) {
+    if grid.codec.is_some() && exchanges.all(|it| it != Exchange::Features) {
         let names: Vec<&str> = grid.method.iter().map(|method| method.name()).collect();
         bail!(
             "grid.codec varies the encoding of feature maps, but grid.method ({}) sends none",
             names.join(", ")
         );
     }
-    ensure!(
-        grid.vehicles.is_none() || exchanges.any(|it| it != Exchange::Nothing),
-        "grid.vehicles varies the transmitting vehicles, but grid.method is none: there are none"
-    );
+    let of_messages = [
+        ("vehicles", grid.vehicles.is_some()),
+        ("latency_ms", grid.latency_ms.is_some()),
+        ("bandwidth_mbps", grid.bandwidth_mbps.is_some()),
+        ("loss", grid.loss.is_some()),
+    ];
+    if let Some((axis, _)) = of_messages.iter().find(|(_, is_given)| *is_given) {
+        let mut methods = grid.method.iter().chain(&grid.reference);
+        let sends = methods.any(|method| method.exchange() != Exchange::Nothing);
+        ensure!(
+            sends,
+            "grid.{axis} varies messages, but grid.method is none: there are none"
+        );
+    }
     let has_seeds = grid.seed.as_ref().is_some_and(|seeds| seeds.len() > 1);
     ensure!(
         !has_seeds || is_random(experiment, link),
@@ -413,6 +409,14 @@ mod tests {
             ),
             ("ego: {id: '7'}\ngrid: {method: [max]}", "protocol.ego_kind"),
             (
+                "ego: {pace: every_sweep}\ngrid: {method: [max]}",
+                "ego.pace has no effect",
+            ),
+            (
+                "ego: {tracks: false}\ngrid: {method: [max]}",
+                "ego.tracks has no effect",
+            ),
+            (
                 "noise_mode: replayed\ngrid: {method: [max], pose_noise: [{position_std_m: 1, heading_std_deg: 1}]}",
                 "noise_mode is replayed, but it is for grid.pose_noise, without a table",
             ),
@@ -425,6 +429,14 @@ mod tests {
                 "poses: noisy.step_s is 0",
             ),
             ("frames: 0\ngrid: {method: [max]}", "frames is 0"),
+            (
+                "grid: {method: [none], loss: [0, 0.5]}",
+                "grid.loss varies messages, but grid.method is none",
+            ),
+            (
+                "grid: {method: [none], latency_ms: [0], jitter_ms: [5]}",
+                "grid.latency_ms varies messages, but grid.method is none",
+            ),
         ] {
             let problem = problem(text);
             assert!(problem.contains(message), "{text}: {problem}");
@@ -480,14 +492,11 @@ mod tests {
         };
         let times = "ego: {deadline_ms: 20, max_age_ms: 100}";
         assert_eq!(of(&format!("link: ideal\n{times}")), "");
+        assert_eq!(of("ego: {max_age_ms: 0}"), "");
         for (settings, message) in [
             (
                 times,
                 "ego.deadline_ms is 20, but without link no time passes",
-            ),
-            (
-                "ego: {max_age_ms: 100}",
-                "ego.max_age_ms is 100, but without link",
             ),
             (
                 "compute: {pose_ms: 0, map_ms: 0, fuse_ms: 9}",
@@ -504,7 +513,7 @@ mod tests {
     }
 
     #[test]
-    fn names_that_are_equal_or_divide_a_table_are_refused_and_so_is_a_training_named_twice() {
+    fn names_that_are_equal_or_divide_a_table_are_refused() {
         let of = |rows: &str, columns: &str| {
             problem(&format!(
                 "tables: [{{name: t, rows: [{rows}], columns: [{columns}]}}]"
@@ -541,11 +550,6 @@ mod tests {
                 "{method: late}, {method: late, vehicles: 2}",
                 two,
                 "rows names \"late\" twice",
-            ),
-            (
-                "{method: late, weights: [a, b, a]}",
-                two,
-                "row late: weights names \"a\" twice",
             ),
             ("", two, "table \"t\": rows is empty"),
         ] {

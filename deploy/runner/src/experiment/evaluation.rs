@@ -1,6 +1,6 @@
 //! Evaluation of one cell of an experiment: a method on recorded scenes, with or without link emulation.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashSet};
 use std::fs;
 use std::ops::ControlFlow;
 use std::path::PathBuf;
@@ -31,6 +31,7 @@ use crate::cached_poses;
 use crate::evaluated_frame::{judge, metrics};
 use crate::experiment::cell::{Cell, CellKey};
 use crate::experiment::frame_files;
+use crate::experiment::report::fewer_frames;
 use crate::scenario::fingerprint::files_of;
 use crate::scenario::weights_choice::weights_of;
 
@@ -80,7 +81,7 @@ impl OpenedData {
     /// Feature maps are cached for all of them, so that another selection needs no others.
     ///
     /// # Errors
-    /// An error when it cannot be read, or the protocol contradicts itself.
+    /// An error when it cannot be read, the protocol contradicts itself, or no scenario has an ego of it.
     pub fn open(trial: &Trial) -> Result<Self> {
         let options = OpenOptions::with_intensity_scale(trial.intensity_scale);
         let dataset = dataset::open_with(&trial.dataset, &options)?;
@@ -89,6 +90,10 @@ impl OpenedData {
         let all = dataset.scenarios.iter();
         let arranged = all.filter_map(|scenario| protocol.arrange(scenario));
         let mut scenarios: Vec<Scenario> = arranged.collect();
+        if scenarios.is_empty() && !dataset.scenarios.is_empty() {
+            let (path, kind) = (trial.dataset.display(), protocol.ego);
+            bail!("{path}: no scenario in it has an ego of the protocol: ego_kind is {kind:?}");
+        }
         let frames = trial.setup.frames.unwrap_or(usize::MAX);
         for scenario in &mut scenarios {
             scenario.ticks.truncate(frames);
@@ -107,6 +112,19 @@ impl OpenedData {
     pub fn chosen(&self, scenarios: Option<usize>) -> impl Iterator<Item = &Scenario> {
         let all: Vec<&Scenario> = self.scenarios.iter().collect();
         evenly_spread(&all, scenarios.unwrap_or(usize::MAX)).into_iter()
+    }
+
+    /// Sentences about what there is less of than was asked for: scenarios with an ego of the protocol, frames.
+    pub fn lacking(&self, scenarios: Option<usize>, frames: Option<usize>) -> Vec<String> {
+        let kept: HashSet<&str> = self.scenarios.iter().map(|one| one.name.as_str()).collect();
+        let all = self.recorded.iter().map(|one| one.name.as_str());
+        let others: Vec<&str> = all.filter(|name| !kept.contains(name)).collect();
+        let others = (!others.is_empty()).then(|| others.join(", "));
+        let others =
+            others.map(|names| format!("left out, without an ego of the protocol: {names}"));
+        let longest = self.chosen(scenarios).map(|one| one.ticks.len()).max();
+        let fewer = fewer_frames(longest.unwrap_or(0), frames);
+        others.into_iter().chain(fewer).collect()
     }
 
     /// Number of frames of so many scenarios.
@@ -173,7 +191,9 @@ impl Trial {
         let maps = contents.contains(&Exchange::Features);
         let boxes = contents.contains(&Exchange::Boxes) || setup.agents.boxes.is_some();
         let messages = contents.iter().any(|one| *one != Exchange::Nothing);
-        let listens = setup.attack.is_some() || setup.ego.trust || setup.delay_ms > 0;
+        // Over a link the ego alone has its compute times.
+        let waits = setup.link.is_some() && setup.compute == ComputeTimes::default();
+        let listens = setup.attack.is_some() || setup.ego.trust || setup.delay_ms > 0 || waits;
         let falsified = setup.attack.map(|attack| attack.falsification);
         let AgentSettings { codec, rate, .. } = &setup.agents;
         let encodes = *codec != CodecConfig::default() || *rate != RateConfig::default();
@@ -188,7 +208,7 @@ impl Trial {
         } else if falsified == Some(Falsification::FalseVelocity) && !boxes {
             "attack false_velocity is for boxes of neighbours: METHODS receives none"
         } else if listens && !messages {
-            "attack, trust and delay_ms are for messages of neighbours: METHODS uses none"
+            "attack, trust, delay_ms and link are for messages of neighbours: METHODS uses none"
         } else {
             return Ok(());
         };
@@ -301,7 +321,7 @@ pub fn compute(
     let (scores, evaluator) = judged(trial, data, key.method, on_frame)?;
     let is_pose =
         |topic: &Topic| matches!(topic, Topic::Stream { stream, .. } if *stream == Stream::Pose);
-    let messages = Messages::of_evaluation(evaluator.ledger(), |topic| !is_pose(topic));
+    let messages = Messages::of_evaluation(&evaluator.ledger, |topic| !is_pose(topic));
     let used = scores.records().iter().map(|record| record.fused as u64);
     // Over a link the time of the scene passes. Without one only the time of computing is known.
     let (clock, seconds) = match trial.setup.link {
@@ -335,8 +355,9 @@ fn judged(
     }
     let (scale, rule) = (trial.intensity_scale, &data.protocol.ground_truth);
     let findings = findings::sampled(&data.scenarios, scale, Some(rule));
-    evaluator.add_data_set(&data.problems, findings);
-    let detector = evaluator.ego().detector().config();
+    evaluator.left_out.add_files(&data.problems);
+    evaluator.left_out.add_findings(findings);
+    let detector = evaluator.ego.detector().config();
     let map_values = detector.feature_grid().cells() as u64 * detector.sent_channels() as u64;
     // Without a compute time, a result is as old as its sweep by definition, which is no latency.
     let Setup { link, compute, .. } = &trial.setup;
@@ -350,8 +371,8 @@ fn judged(
             continue;
         };
         // One set of scores over all scenarios: AP orders the detections of all frames together.
-        let scores = scores
-            .get_or_insert_with(|| FrameScores::new(ego.clone(), *evaluator.rule(), map_values));
+        let scores =
+            scores.get_or_insert_with(|| FrameScores::new(ego.clone(), evaluator.rule, map_values));
         scores.change_ego(ego);
         let judged = evaluator.run(scenario, &mut |frame| {
             // It is counted as left out.
@@ -371,7 +392,7 @@ fn judged(
     }
     let scores = scores.filter(|scores| !scores.records().is_empty());
     let scores = scores.with_context(|| {
-        let (path, reasons) = (trial.dataset.display(), evaluator.left_out().reasons());
+        let (path, reasons) = (trial.dataset.display(), evaluator.left_out.reasons());
         format!("{path}: there is no frame in it that can be evaluated{reasons}")
     })?;
     let finished = files.map(|files| frame_files::finish(files, &scores));
@@ -394,6 +415,7 @@ mod tests {
     use std::path::Path;
 
     use agent::attack::AttackConfig;
+    use dataset::evaluation_protocol::EgoKind;
 
     use super::*;
 
@@ -408,6 +430,32 @@ mod tests {
                 fs::write(folder.join("000000.pcd"), "").unwrap();
             }
         }
+    }
+
+    #[test]
+    fn scenarios_without_an_ego_of_the_protocol_and_fewer_frames_are_named() {
+        let folder = tempfile::tempdir().unwrap();
+        write_scenarios(folder.path());
+        let mut trial = Trial {
+            dataset: folder.path().to_owned(),
+            ..Trial::default()
+        };
+        trial.protocol.ego_kind = Some(EgoKind::Unit);
+        let none = OpenedData::open(&trial).unwrap_err().to_string();
+        assert!(
+            none.ends_with("of the protocol: ego_kind is Unit"),
+            "{none}"
+        );
+        let unit = folder.path().join("pair/2");
+        fs::rename(unit, folder.path().join("pair/-1")).unwrap();
+        let data = OpenedData::open(&trial).unwrap();
+        let others = "left out, without an ego of the protocol: alone, three";
+        assert_eq!(data.lacking(None, Some(1)), [others]);
+        trial.protocol.ego_kind = None;
+        let data = OpenedData::open(&trial).unwrap();
+        assert!(data.lacking(None, None).is_empty());
+        let fewer = "9 frames were asked for, there were 1";
+        assert_eq!(data.lacking(Some(1), Some(9)), [fewer]);
     }
 
     #[test]

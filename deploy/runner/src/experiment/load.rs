@@ -33,7 +33,7 @@ impl Experiment {
         }
         // A name that is no preset is the path of a file.
         if let Some(link) = &mut self.link
-            && LinkConfig::preset(link).is_err()
+            && LinkConfig::preset(link).is_none()
         {
             *link = folder.join(&link).to_string_lossy().into_owned();
         }

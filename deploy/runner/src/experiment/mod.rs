@@ -10,3 +10,4 @@ pub mod slices;
 pub mod spec;
 pub mod sweep;
 pub mod table;
+pub mod without_effect;

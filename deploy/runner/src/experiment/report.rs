@@ -49,13 +49,18 @@ pub fn print_unlocated(metrics: &Metrics, pose: &PoseSourceConfig, scene: &Path)
     };
     if metrics.pose.mean_m.is_none() && metrics.pose.no_pose > 0 {
         let dataset = dataset::open(scene).ok();
-        let scenarios = dataset.map_or(Vec::new(), |dataset| dataset.scenarios);
-        let map = scenarios
-            .first()
-            .and_then(|scenario| scenario.generated_map().ok());
+        let map = dataset.and_then(|dataset| dataset.scenarios.first()?.generated_map().ok());
         let (map, no_pose) = (map.map(|map| map.to_string()), metrics.pose.no_pose);
         output::note(wrong_place_hint(no_pose, &head, map.as_deref()));
     }
+}
+
+/// Sentence about the number of frames of a scenario where it is below the one that was asked for.
+pub fn fewer_frames(frames: usize, asked: Option<usize>) -> Option<String> {
+    let asked = asked.filter(|asked| *asked > frames)?;
+    Some(format!(
+        "{asked} frames were asked for, there were {frames}"
+    ))
 }
 
 /// Lines about one run below its row of the table.

@@ -36,19 +36,15 @@ pub struct Experiment {
     /// Data set, split or scenario; the first vehicle of each scenario is the ego.
     pub dataset: PathBuf,
     /// Settings of the generator for a `dataset` that does not exist.
-    #[serde(default)]
     pub generate: Option<Generate>,
     /// Number of scenarios, evenly spread; absent: all.
-    #[serde(default)]
     pub scenarios: Option<usize>,
     /// Largest number of frames of each scenario; absent: all.
-    #[serde(default)]
     pub frames: Option<usize>,
     /// Participating vehicles, counted annotations and objects.
     #[serde(default)]
     pub protocol: ProtocolConfig,
     /// Weights, or a folder with a file `*-METHOD.safetensors` for each method; rows of tables may name their own.
-    #[serde(default)]
     pub weights: Option<PathBuf>,
     /// Number format in which networks are computed.
     #[serde(default)]
@@ -63,7 +59,7 @@ pub struct Experiment {
     #[serde(default)]
     pub noise_mode: NoiseMode,
     /// Deadline, age and trust of the ego; `protocol.ego_kind` selects the vehicle. Without a link no time passes, and
-    /// deadline and age are refused.
+    /// the deadline is refused; `inbox`, `pace` and `tracks` always.
     #[serde(default)]
     pub ego: EgoSettings,
     /// Compute times of the stages, over a link.
@@ -71,10 +67,8 @@ pub struct Experiment {
     pub compute: ComputeTimes,
     /// Link emulation in simulation time: a preset of `sim-replay link`, or a file. Absent: an ideal link for a grid,
     /// which varies it, and none for tables.
-    #[serde(default)]
     pub link: Option<String>,
     /// Folder of cached feature maps of tables; absent: they are computed for every cell.
-    #[serde(default)]
     pub feature_maps: Option<PathBuf>,
     /// Largest cache of feature maps per encoder, gigabytes.
     #[serde(default = "gigabytes")]
@@ -107,32 +101,24 @@ pub struct Generate {
 pub struct Grid {
     /// Fusion methods.
     pub method: Vec<Method>,
-    /// Encodings of feature maps.
-    #[serde(default)]
+    /// Encodings of feature maps; methods that exchange none have the first only.
     pub codec: Option<Vec<CodecSpec>>,
     /// Further methods, for comparison: with the first encoding only.
     #[serde(default)]
     pub reference: Vec<Method>,
     /// Mean delay after the last bit was sent, milliseconds.
-    #[serde(default)]
     pub latency_ms: Option<Vec<f64>>,
     /// Standard deviation of that delay, milliseconds; no delay is below 0.
-    #[serde(default)]
     pub jitter_ms: Option<Vec<f64>>,
     /// Rate of each link, Mbit/s; `.inf`: unlimited.
-    #[serde(default)]
     pub bandwidth_mbps: Option<Vec<f64>>,
     /// Fraction of the messages that are lost.
-    #[serde(default)]
     pub loss: Option<Vec<f64>>,
     /// Errors of the poses.
-    #[serde(default)]
     pub pose_noise: Option<Vec<NoiseSpec>>,
     /// Number of participating vehicles, the ego included; absent: all.
-    #[serde(default)]
     pub vehicles: Option<Vec<usize>>,
     /// Seeds of losses, delays and pose errors.
-    #[serde(default)]
     pub seed: Option<Vec<u64>>,
 }
 
@@ -190,7 +176,6 @@ pub struct Table {
     /// Name of its files.
     pub name: String,
     /// Largest number of scenarios to evaluate, evenly spread over the data set; absent: all.
-    #[serde(default)]
     pub scenarios: Option<usize>,
     /// Its rows.
     pub rows: Vec<Row>,
@@ -203,7 +188,6 @@ pub struct Table {
 #[serde(deny_unknown_fields)]
 pub struct Row {
     /// First column of the row; absent: the method. Different for each row, without `|` and line ends.
-    #[serde(default)]
     pub name: Option<String>,
     /// Fusion method.
     pub method: Method,
@@ -211,16 +195,12 @@ pub struct Row {
     #[serde(default)]
     pub weights: Vec<PathBuf>,
     /// Pose source of this row, in place of that of the columns.
-    #[serde(default)]
     pub poses: Option<PoseSourceConfig>,
     /// Number of participating vehicles, the ego included; absent: all. Annotations of the others count.
-    #[serde(default)]
     pub vehicles: Option<usize>,
     /// Neighbours send their detections in place of feature maps, or beside them.
-    #[serde(default)]
     pub boxes: Option<SentBoxes>,
     /// Weights of neighbours with a network of their own. Absent: that of the row.
-    #[serde(default)]
     pub neighbour_weights: Option<PathBuf>,
     /// Box alignment of the ego.
     #[serde(default)]
@@ -234,14 +214,12 @@ pub struct Column {
     /// Title of the column: different for each, without `|` and line ends.
     pub name: String,
     /// Pose source; absent: that of the experiment.
-    #[serde(default)]
     pub poses: Option<PoseSourceConfig>,
     /// Delay of the messages of neighbours without a link, milliseconds.
     #[serde(default)]
     pub delay_ms: u64,
     /// Attack by neighbours; absent: none. More attackers than any scenario has neighbours are refused; a row
     /// without neighbours has none.
-    #[serde(default)]
     pub attack: Option<AttackConfig>,
     /// Misbehaviour detection of the ego.
     #[serde(default)]

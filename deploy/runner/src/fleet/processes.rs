@@ -10,7 +10,7 @@ use deploy::operate::run_folder::{CHECKPOINT, RECORDING, RunFolder, RunFolderErr
 use deploy::operate::security::RunKeys;
 use deploy::operate::supervise::{ProcessSpec, RestartPolicy};
 use deploy::operate::{RECORDER, REPLAY};
-use ego_fuser::config::EgoConfig;
+use ego_fuser::config::{EgoConfig, EgoSettings, PaceMode};
 use fusion::Exchange;
 use protocol::{CavId, RunId, Stream};
 use serde::Serialize;
@@ -20,7 +20,7 @@ use sim_replay::config::{
 use support::random::scenario_seed;
 
 use super::Fleet;
-use crate::scenario::Clock;
+use crate::scenario::{Clock, Scenario};
 
 /// Result of planning: a [`RunFolderError`] if nothing else is named.
 type Result<T, E = RunFolderError> = std::result::Result<T, E>;
@@ -144,7 +144,7 @@ impl Fleet {
             run: context.run.clone(),
             models: self.scenario.models.clone(),
             method: Some(self.scenario.method),
-            ego: self.scenario.ego.clone(),
+            ego: ego_settings(&self.scenario),
             neighbours: Vec::new(),
             comm_range_m: self.protocol.ground_truth.comm_range_m,
             over_link: self.is_over_link(),
@@ -248,6 +248,15 @@ impl Planner<'_> {
     }
 }
 
+/// Settings of the ego. In lockstep every tick is answered, which a pace would leave unanswered until the timeout.
+fn ego_settings(scenario: &Scenario) -> EgoSettings {
+    let mut settings = scenario.ego.clone();
+    if scenario.scene.lockstep {
+        settings.pace = PaceMode::EverySweep;
+    }
+    settings
+}
+
 /// Pool of each of some processes, MiB: the `wanted` one, or 0 with a warning where the system has no room for all.
 fn pool_mib(wanted: usize, processes: usize) -> usize {
     match bus::check_room(wanted.saturating_mul(processes << 20)) {
@@ -264,6 +273,18 @@ fn pool_mib(wanted: usize, processes: usize) -> usize {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn in_lockstep_the_ego_asks_for_every_sweep() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("s.yaml");
+        for (lockstep, pace) in [(true, PaceMode::EverySweep), (false, PaceMode::Auto)] {
+            let text = format!("scene: {{dir: ., lockstep: {lockstep}}}\nmodels: {{weights: .}}\n");
+            std::fs::write(&file, text).unwrap();
+            let scenario = Scenario::read(&file).unwrap();
+            assert_eq!(ego_settings(&scenario).pace, pace, "lockstep {lockstep}");
+        }
+    }
 
     #[test]
     fn where_not_all_pools_have_room_messages_take_the_socket() {

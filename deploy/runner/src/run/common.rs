@@ -10,8 +10,9 @@ use deploy::report::RunReport;
 use deploy::score::metrics::Metrics;
 use deploy::score::scorer_cav;
 use protocol::{KeyExpr, Reconciliation, Role, RunId};
+use support::output;
 
-use crate::fleet::Fleet;
+use crate::fleet::{Fleet, unused_weights};
 use crate::run::RunError;
 
 /// Settings of a run beside its scenario.
@@ -58,6 +59,8 @@ pub(super) fn in_folder(
     options: &RunOptions,
     go: impl FnOnce(&RunId, &RunFolder) -> Result<RunResult, RunError>,
 ) -> Result<RunResult, RunError> {
+    let unused = unused_weights(&fleet.scenario, &fleet.ego);
+    unused.into_iter().for_each(output::note);
     let named = fleet.scenario.run.clone();
     let run = named.unwrap_or_else(|| name_of_now(options.prefix));
     let folder = RunFolder::create(&options.runs, &run)?;

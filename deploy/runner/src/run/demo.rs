@@ -45,7 +45,7 @@ fn try_draw(fleet: &Fleet, frame: &JudgedFrame, path: &Path) -> Result<()> {
         let ego_from_cav = world_from_ego.from_world(&world_from_cav);
         loaded.push((cav.to_string(), ego_from_cav, recorded.points.xyzi));
     }
-    let rule = fleet.ground_truth_rule();
+    let rule = fleet.applied_protocol().ground_truth;
     let found = frame.result.detections.iter();
     let detections: Vec<_> = found.map(|found| (found.box3d, found.score)).collect();
     let [x_m, y_m] = [(0, rule.x_m), (1, rule.y_m)].map(|(axis, limit): (usize, [f64; 2])| {

@@ -143,7 +143,8 @@ fn start_scorer(
     specs: &[ProcessSpec],
 ) -> Result<ScorerNode> {
     let (ego, agents) = (&fleet.ego, &fleet.agents);
-    let board = FrameScores::new(ego.clone(), fleet.ground_truth_rule(), fleet.map_values());
+    let rule = fleet.applied_protocol().ground_truth;
+    let board = FrameScores::new(ego.clone(), rule, fleet.map_values());
     let [detections, truth, tracks] = LINES.map(|name| context.folder.file(name));
     let tracks = fleet.scenario.ego.tracks.then_some(tracks);
     let (session, lines) = (router.place.session.clone(), [detections, truth]);

@@ -61,7 +61,7 @@ pub fn run_scenario(scenario: &Scenario, options: &RunOptions) -> Result<RunResu
 
 /// Computes all ticks; detections are appended to their file.
 fn play(fleet: &Fleet, evaluator: &mut Evaluator, folder: &RunFolder) -> Result<FrameScores> {
-    let (rule, map_values) = (fleet.ground_truth_rule(), fleet.map_values());
+    let (rule, map_values) = (fleet.applied_protocol().ground_truth, fleet.map_values());
     let mut board = FrameScores::new(fleet.ego.clone(), rule, map_values);
     let lines = FrameLines::create(folder.path()).at(folder.path());
     let mut lines = lines.map_err(RunFolderError::Write)?;
@@ -85,7 +85,7 @@ fn write(
     (run, folder): (&RunId, RunFolder),
     options: &RunOptions,
 ) -> Result<RunResult> {
-    let ledger = evaluator.ledger();
+    let ledger = &evaluator.ledger;
     let balance = ledger.balance();
     let (poses, seconds) = (fleet.pose_source(), board.seconds());
     let mut metrics = metrics(board, evaluator, "stepped", poses, seconds);

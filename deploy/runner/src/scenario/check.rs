@@ -3,6 +3,8 @@
 use std::path::Path;
 
 use bus::Endpoint;
+use ego_fuser::config::PaceMode;
+use localization::pose_source::PoseSourceConfig;
 use perception::compute_device::ComputeDevice;
 use protocol::config::{FieldError, above_zero, require, within};
 use support::file_error::{AtFile, FileError};
@@ -25,6 +27,11 @@ impl Scenario {
         self.models.validate()?;
         self.check_security()?;
         self.check_network()?;
+        // After the first lap no capture time is one of the table.
+        let is_cached = |pose: PoseSourceConfig| matches!(pose, PoseSourceConfig::Cached(_));
+        let is_looped = self.scene.repeat && self.poses().into_iter().any(is_cached);
+        let rule = "must be false with agents.pose cached: its table has the times of one lap only";
+        require(!is_looped, "scene.loop", true, rule)?;
         match &self.ego.id {
             Some(ego) if !self.scene.agents.is_empty() && !self.scene.agents.contains(ego) => Err(
                 FieldError::new("ego.id", ego, "must be one of scene.agents"),
@@ -105,18 +112,9 @@ impl Scenario {
             return Ok(());
         };
         let elsewhere = self.network.connect.is_some() || !self.remote_agents.is_empty();
-        if security.keys.is_none() && elsewhere {
-            let rule = "must name the folder of `v2vloc keys`: processes on other hosts need keys of the same authority";
-            return Err(FieldError::new("security.keys", "left out", rule));
-        }
-        match &self.network.connect {
-            Some(router) if self.clock == Clock::Stepped => {
-                let rule =
-                    "runs in simulation time have a router of their own when there is security";
-                Err(FieldError::new("network.connect", router, rule))
-            }
-            _ => Ok(()),
-        }
+        let rule = "must name the folder of `v2vloc keys`: processes on other hosts need keys of the same authority";
+        let is_sound = security.keys.is_some() || !elsewhere;
+        require(is_sound, "security.keys", format_args!("left out"), rule)
     }
 
     /// Checks that no field contradicts the clock: simulation time has no pace, no waiting and no other hosts.
@@ -127,7 +125,13 @@ impl Scenario {
             return require(is_left_out, "stepped", format_args!("given"), rule);
         }
         let (scene, remote) = (&self.scene, self.remote_agents.first());
+        let (pace, metrics) = (self.ego.pace != PaceMode::Auto, self.network.metrics);
+        let is_secured = self.security.is_some();
         let off = "must be false with clock stepped";
+        let own = "runs in simulation time have a router of their own when there is security";
+        let connect = self.network.connect.clone();
+        let auto = "must be auto with clock stepped, which computes every sweep";
+        let out = "must be left out with clock stepped, which runs here and publishes nothing";
         let refused = [
             (
                 "scene.rate",
@@ -136,35 +140,23 @@ impl Scenario {
             ),
             ("scene.loop", scene.repeat.then(|| "true".into()), off),
             ("scene.lockstep", scene.lockstep.then(|| "true".into()), off),
+            ("ego.pace", pace.then(|| "every_sweep".into()), auto),
             (
                 "models.device",
                 (self.models.device != ComputeDevice::Cpu).then(|| "cuda".into()),
                 "must be cpu with clock stepped, whose results are the same bytes on any machine",
             ),
-            (
-                "record",
-                self.record.as_ref().map(|_| "given".into()),
-                "must be left out with clock stepped, whose processes publish nothing",
-            ),
-            (
-                "network.metrics",
-                self.network.metrics.map(|address| address.to_string()),
-                "must be left out with clock stepped",
-            ),
-            (
-                "remote_agents",
-                remote.map(ToString::to_string),
-                "must be left out with clock stepped, whose processes run here",
-            ),
+            ("record", self.record.as_ref().map(|_| "given".into()), out),
+            ("network.connect", connect.filter(|_| is_secured), own),
+            ("network.metrics", metrics.map(|at| at.to_string()), out),
+            ("remote_agents", remote.map(ToString::to_string), out),
         ];
         for (field, found, rule) in refused {
             if let Some(found) = found {
                 return Err(FieldError::new(field, found, rule));
             }
         }
-        match self.stepped.and_then(|stepped| stepped.compute) {
-            Some(compute) => compute.validate("stepped.compute"),
-            None => Ok(()),
-        }
+        let compute = self.stepped.and_then(|stepped| stepped.compute);
+        compute.map_or(Ok(()), |compute| compute.validate("stepped.compute"))
     }
 }

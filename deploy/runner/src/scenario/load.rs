@@ -65,7 +65,7 @@ impl Scenario {
             own.change(|settings| with_files(settings, path, folder))?;
         }
         if let Some(link) = &mut scenario.link
-            && LinkConfig::preset(&link.model).is_err()
+            && LinkConfig::preset(&link.model).is_none()
         {
             let model = without_dots(&folder.join(&link.model));
             link.model = model.to_string_lossy().into_owned();
@@ -76,17 +76,14 @@ impl Scenario {
 
 /// Settings with their files found in `folder`, and the networks; errors name `path`.
 fn with_files(settings: AgentSettings, path: &Path, folder: &Path) -> Result<AgentSettings> {
-    let pose = settings
-        .pose
-        .map_files(|file| without_dots(&folder.join(file)));
+    let found = |file: &Path| without_dots(&folder.join(file));
+    let pose = settings.pose.map_files(found);
     let pose = pose
         .with_networks()
         .map_err(|error| FileError::new(path, format_args!("agents.pose: {error}")))?;
     Ok(AgentSettings {
         pose,
-        weights: settings
-            .weights
-            .map(|weights| without_dots(&folder.join(weights))),
+        weights: settings.weights.map(|weights| found(&weights)),
         ..settings
     })
 }
@@ -378,6 +375,10 @@ mod tests {
             ),
             ("scene: {dir: .}\nstepped: {}", "stepped is given"),
             (
+                "scene: {dir: ., loop: true}\nvehicles: {a: {pose: {cached: {file: s.yaml}}}}",
+                "scene.loop is true: must be false with agents.pose cached",
+            ),
+            (
                 "scene: {dir: .}\nvehicles: {a: {falsification: false_velocity}}",
                 "agents.falsification is false_velocity: needs boxes",
             ),
@@ -396,6 +397,10 @@ mod tests {
             (
                 "scene: {dir: .}\nclock: stepped\nmodels: {weights: s.yaml, device: cuda}",
                 "models.device is cuda: must be cpu with clock stepped",
+            ),
+            (
+                "scene: {dir: .}\nclock: stepped\nego: {pace: every_sweep}",
+                "ego.pace is every_sweep: must be auto with clock stepped",
             ),
             (
                 "scene: {dir: .}\nmodels: {weights: none.safetensors}",

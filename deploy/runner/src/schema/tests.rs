@@ -6,6 +6,7 @@ use agent::config::AgentConfig;
 use bus::{Configured, ProcessConfig, minimal};
 use clap::{Arg, Args, Command};
 use ego_fuser::config::EgoConfig;
+use schemars::JsonSchema;
 use serde_json::Value;
 use sim_replay::config::{LinkProcessConfig, RecorderConfig, ReplayConfig};
 
@@ -112,7 +113,8 @@ fn definition<'a>(schema: &'a Value, name: &str) -> &'a Value {
 }
 
 fn schema_of<T: JsonSchema>() -> Value {
-    serde_json::from_str(&text_of::<T>()).unwrap()
+    let generator = SchemaGenerator::new(SchemaSettings::draft07());
+    generator.into_root_schema_for::<T>().to_value()
 }
 
 /// Setting beside the recorder's that `v2vloc up` gives to other processes.

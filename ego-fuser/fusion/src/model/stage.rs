@@ -8,6 +8,7 @@ use perception::layers::head::HeadOutput;
 use perception::model_config::{ConfigError, DetectorConfig, YAxis};
 use perception::weights::{FileError, METHOD_KEY, Weights};
 use protocol::{BevGrid, Pose};
+use support::file_error::AtFile;
 use tch::nn::{self, VarStore};
 use tch::{Device, Tensor};
 
@@ -25,17 +26,6 @@ use crate::{Fusion, FusionOutput};
 /// Prefix of the fusion's variables in a weights file.
 pub(crate) const FUSION_PREFIX: &str = "fusion.";
 
-/// Error of reading a fusion from a weights file.
-#[derive(Debug, thiserror::Error)]
-pub enum StageError {
-    /// The configuration is invalid.
-    #[error(transparent)]
-    Config(#[from] ConfigError),
-    /// The weights do not fit; the method of the file is named if it is another one.
-    #[error(transparent)]
-    Weights(#[from] FileError),
-}
-
 /// Channel mixing, warp and fusion of one network.
 ///
 /// Everything runs on the device of its maps. Maps on the CPU that need no gradient are read and fused in plain floats in
@@ -43,7 +33,8 @@ pub enum StageError {
 #[derive(Debug)]
 pub struct FusionStage {
     config: FusionConfig,
-    requirements: Requirements,
+    /// Inputs that the fusion needs beyond the newest map of every agent.
+    pub requirements: Requirements,
     fusion: Box<dyn Fusion>,
     mixing: Option<ChannelMixing>,
     /// Reads neighbours' boxes, where the weights have it.
@@ -94,16 +85,18 @@ impl FusionStage {
     /// `device`.
     ///
     /// # Errors
-    /// [`StageError`] names the file and the first parameter that is missing or of another shape.
+    /// [`FileError`] names the file and the first parameter that is missing or of another shape, and the method of the
+    /// file if it is another one.
     pub fn from_weights(
         weights: &Weights,
         method: Method,
         detector: &DetectorConfig,
         device: Device,
-    ) -> Result<Self, StageError> {
+    ) -> Result<Self, FileError> {
         let variables = VarStore::new(device);
         let config = stored_config(weights, method, detector)?;
-        let mut stage = Self::new(&variables.root(), &config, method, detector)?;
+        let stage = Self::new(&variables.root(), &config, method, detector);
+        let mut stage = stage.at(weights.path())?;
         if box_input::is_in(weights) {
             stage.add_box_input(&variables.root(), detector);
         }
@@ -181,11 +174,6 @@ impl FusionStage {
     /// Settings that the fusion was built from.
     pub fn config(&self) -> &FusionConfig {
         &self.config
-    }
-
-    /// Inputs that the fusion needs beyond the newest map of every agent.
-    pub fn requirements(&self) -> &Requirements {
-        &self.requirements
     }
 
     /// Warps maps onto the ego's grid: `received` are `N`, each in the axes of its sender, as are `metadata`: the ego's
@@ -447,6 +435,7 @@ mod tests {
     use tch::Kind;
 
     use super::*;
+    use crate::disconet::DiscoNetConfig;
 
     fn fused(detector: &DetectorConfig, maps: &Tensor, facts: &[MapMetadata]) -> Tensor {
         let stage = FusionStage::untrained(Method::ATTENTION, detector, Device::Cpu).unwrap();
@@ -487,6 +476,22 @@ mod tests {
         let here = fused(&plain, &maps, &facts);
         let there = fused(&mirrored, &maps.flip([2]), &facts).flip([1]);
         assert!(here.allclose(&there, 1e-3, 1e-3, false));
+    }
+
+    #[test]
+    fn settings_of_no_fusion_are_named_with_their_file() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("weights.safetensors");
+        let settings = FusionConfig::new(DiscoNetConfig::full(0));
+        let about = [(FUSION_KEY.to_owned(), settings.to_json())].into();
+        let nothing = VarStore::new(Device::Cpu);
+        save(&path, &nothing, &about, Precision::Single).unwrap();
+        let (weights, lean) = (Weights::load(&path).unwrap(), DetectorConfig::lean());
+        let stage = FusionStage::from_weights(&weights, Method::DISCONET, &lean, Device::Cpu);
+        let message = stage.unwrap_err().to_string();
+        for part in ["weights.safetensors: ", "fusion channels is 0"] {
+            assert!(message.contains(part), "{message}");
+        }
     }
 
     #[test]

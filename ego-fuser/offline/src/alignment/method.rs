@@ -92,8 +92,8 @@ impl NotAligned {
             Self::Boxes(NoAlignment::TooFewMatches { .. }) => "too_few_matches",
             Self::Boxes(NoAlignment::Ambiguous { .. }) => "ambiguous",
             Self::Clouds(NoIcpFit::TooFew { .. }) => "too_few_points",
-            Self::Clouds(NoIcpFit::TooLittleOverlap { .. }) => "too_little_overlap",
-            Self::Clouds(NoIcpFit::Unconstrained { .. }) => "unconstrained",
+            Self::Clouds(NoIcpFit::TooLittleOverlap(_)) => "too_little_overlap",
+            Self::Clouds(NoIcpFit::Unconstrained(_)) => "unconstrained",
             Self::Message => "message",
         }
     }

@@ -4,22 +4,18 @@ use std::collections::BTreeMap;
 use std::rc::Rc;
 
 use agent_offline::evaluation::estimate_pose;
+use dataset::frame::Frame;
 use localization::pose_source::{PoseSource, PoseSourceError};
-use protocol::CavId;
 use protocol::message::Message;
+use protocol::{CavId, Pose};
 
 use super::method::{
     AlignError, AlignInput, Alignment, AlignmentMethod, AlignmentSpec, NotAligned, pose_difference,
 };
 
-/// Pose of the recording that a source gets as its measurement.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum GivenPose {
-    /// The true one: for sources that add an error to it. Sources that localise by sweeps ignore it.
-    True,
-    /// Estimate of the GNSS and IMU filter.
-    Gnss,
-}
+/// Pose of the recording that a source gets as its measurement: that of the GNSS and IMU filter, or the true one for
+/// sources that add an error to it. Sources that localise by sweeps ignore it.
+pub type GivenPose = fn(&Frame) -> Option<Pose>;
 
 type Build = dyn Fn() -> Result<Box<dyn PoseSource>, PoseSourceError>;
 
@@ -50,10 +46,7 @@ impl Poses {
 impl AlignmentMethod for Poses {
     fn prepare(&mut self, vehicle: &AlignInput<'_>) -> Result<Message, AlignError> {
         let frame = vehicle.frame;
-        let measured = match self.measured {
-            GivenPose::True => frame.world_from_lidar,
-            GivenPose::Gnss => frame.gnss_world_from_lidar(),
-        };
+        let measured = (self.measured)(frame);
         let source = match self.sources.entry(frame.cav.clone()) {
             std::collections::btree_map::Entry::Occupied(known) => known.into_mut(),
             std::collections::btree_map::Entry::Vacant(place) => place.insert((self.build)()?),

@@ -8,8 +8,9 @@ use agent_offline::icp_map::{IcpMapPose, read_map};
 use anyhow::{Context, Result};
 use bus::config_file;
 use clap::ValueEnum;
+use dataset::frame::Frame;
 use dataset::{self, Dataset, LeftOut, Scenario};
-use ego_fuser_offline::alignment::{AlignmentSpec, BoxIcp, CloudIcp, FreeAlign, GivenPose, Poses};
+use ego_fuser_offline::alignment::{AlignmentSpec, BoxIcp, CloudIcp, FreeAlign, Poses};
 use ego_fuser_offline::evaluation::alignment::table::{MethodRow, PairTally, markdown};
 use ego_fuser_offline::evaluation::alignment::{self, BoxSource};
 use localization::pose_source::{PoseSource, PoseSourceConfig, RecordedPose};
@@ -157,7 +158,9 @@ impl Arguments {
 
     fn built_in(&self, method: BuiltIn, left_out: &mut LeftOut) -> Result<AlignmentSpec> {
         Ok(match method {
-            BuiltIn::Gnss => Poses::spec("gnss", GivenPose::Gnss, || Ok(Box::new(RecordedPose))),
+            BuiltIn::Gnss => Poses::spec("gnss", Frame::gnss_world_from_lidar, || {
+                Ok(Box::new(RecordedPose))
+            }),
             BuiltIn::Icp => CloudIcp::spec(false),
             BuiltIn::IcpGnss => CloudIcp::spec(true),
             BuiltIn::IcpMap => self.icp_map(left_out)?,
@@ -176,9 +179,11 @@ impl Arguments {
             read_map(&self.icp_map, self.map_spacing_m, &config, left_out).map_err(BadInput::of)?;
         tracing::info!(planes = map.planes(), "map");
         let source = IcpMapPose::new(Arc::new(map), config);
-        Ok(Poses::spec("icp-map", GivenPose::Gnss, move || {
-            Ok(Box::new(source.clone()) as Box<dyn PoseSource>)
-        }))
+        Ok(Poses::spec(
+            "icp-map",
+            Frame::gnss_world_from_lidar,
+            move || Ok(Box::new(source.clone()) as Box<dyn PoseSource>),
+        ))
     }
 
     fn box_source(&self, boxes: BoxOrigin, methods: &[AlignmentSpec]) -> Result<BoxSource> {
@@ -228,7 +233,8 @@ fn from_source((name, file): &(String, PathBuf)) -> Result<AlignmentSpec> {
     // Built once already here: a source that cannot be built is an error before the comparison.
     let built = config.build(Inference::default());
     built.at(file).map_err(BadInput::of)?;
-    Ok(Poses::spec(name.clone(), GivenPose::True, move || {
+    let given = |frame: &Frame| frame.world_from_lidar;
+    Ok(Poses::spec(name.clone(), given, move || {
         config.build(Inference::default())
     }))
 }

@@ -21,11 +21,8 @@ use support::output;
 use terminal::progress;
 use terminal::text_table::number;
 
-/// A data set with its evaluation protocol.
-struct EvalSet {
-    protocol: EvaluationProtocol,
-    scenarios: Vec<Scenario>,
-}
+/// A data set's evaluation protocol and scenarios.
+type EvalSet = (EvaluationProtocol, Vec<Scenario>);
 
 /// Measures AP on datasets, with true poses, without delay and without loss.
 #[derive(Debug, clap::Args)]
@@ -92,10 +89,7 @@ impl Arguments {
                 let most = self.frames.map_or(usize::MAX, |frames| frames as usize);
                 scenario.ticks.truncate(most);
             }
-            all.push(EvalSet {
-                protocol,
-                scenarios,
-            });
+            all.push((protocol, scenarios));
         }
         Ok(all)
     }
@@ -112,11 +106,11 @@ impl Arguments {
         }
         let mut detector = OfflineDetector::load(&self.weights).map_err(BadInput::of)?;
         let mut tally = MethodTotals::default();
-        let all = data
-            .iter()
-            .flat_map(|data| data.scenarios.iter().map(move |it| (data, it)));
-        for (data, scenario) in all {
-            let rule = data.protocol.rule_within(detector.config().lidar_range_m);
+        let all = data.iter().flat_map(|(protocol, scenarios)| {
+            scenarios.iter().map(move |scenario| (protocol, scenario))
+        });
+        for (protocol, scenario) in all {
+            let rule = protocol.rule_within(detector.config().lidar_range_m);
             for tick in 0..scenario.ticks.len() {
                 let loaded =
                     scenario.load_tick(tick, 0..scenario.agents.len(), &LoadOptions::default());
@@ -159,19 +153,19 @@ impl Arguments {
     ) -> Result<Value> {
         let mut tally = MethodTotals::default();
         let mut name = "";
-        for data in data {
+        for (protocol, scenarios) in data {
             let mut setup = Setup {
                 method,
-                protocol: Some(data.protocol.clone()),
+                protocol: Some(protocol.clone()),
                 ..Setup::default()
             };
             setup.models.weights.clone_from(&self.weights);
             setup.models.precision = self.precision;
             let mut evaluator = Evaluator::new(setup).map_err(BadInput::of)?;
-            name = evaluator.ego().method().name();
-            let frames = data.scenarios.iter().map(|scenario| scenario.ticks.len());
+            name = evaluator.ego.method().name();
+            let frames = scenarios.iter().map(|scenario| scenario.ticks.len());
             let bar = progress::bar(frames.sum(), "frames").with_message(name);
-            for scenario in &data.scenarios {
+            for scenario in scenarios {
                 // The callback never ends the run.
                 let _ = evaluator.run(scenario, &mut |frame| {
                     tally.add(&frame);
@@ -180,7 +174,7 @@ impl Arguments {
                 })?;
             }
             bar.finish_and_clear();
-            left_out.merge(evaluator.left_out());
+            left_out.merge(&evaluator.left_out);
         }
         Ok(self.row(&tally, name)?)
     }
@@ -206,14 +200,14 @@ impl Arguments {
     /// Prints rows as JSON with the protocol of each data set, as it applies to the area of the network, and with
     /// command and digests of the program, the weights, the scripts and the evaluated data.
     fn print_json(&self, mut rows: Vec<Value>, data: &[EvalSet], area_m: [f64; 6]) -> Result<()> {
-        let protocols = data.iter().map(|data| data.protocol.within(area_m));
+        let protocols = data.iter().map(|(protocol, _)| protocol.within(area_m));
         let protocols = json!(protocols.collect::<Vec<_>>());
         for row in &mut rows {
             row["protocols"] = protocols.clone();
         }
         let scripts = self.method.iter().filter_map(|method| method.script_file());
         let files = scripts.chain([self.weights.as_path()]).map(Path::to_owned);
-        let scenarios = data.iter().flat_map(|data| &data.scenarios);
+        let scenarios = data.iter().flat_map(|(_, scenarios)| scenarios);
         output::line(rows_with_provenance(&rows, scenarios, files)?)?;
         Ok(())
     }

@@ -45,7 +45,8 @@ pub(crate) struct Arguments {
     #[arg(long, value_name = "NAME|FILE", default_value = "lean", conflicts_with = "init", value_parser = parse_network)]
     network: DetectorConfig,
     /// Weights to begin with, for example those of `none`.
-    #[arg(long, value_name = "FILE")]
+    // Required as a group of one option: clap forgets the requirement of an option that another excludes.
+    #[arg(long, value_name = "FILE", group = "beginning")]
     init: Option<PathBuf>,
     /// Samples of a step.
     #[arg(long, default_value_t = 4)]
@@ -97,7 +98,7 @@ pub(crate) struct Arguments {
     #[arg(long, default_value_t = 0.0)]
     alignment_weight: f64,
     /// Freeze the encoder of --init and train the fusion and the head only: fast, as maps are computed once.
-    #[arg(long, requires = "init")]
+    #[arg(long, requires = "beginning")]
     freeze_encoder: bool,
     /// Freeze the method and the head of --init too, and train a box input behind it, a part that reads the boxes
     /// of neighbours that send no map, and the refinement of the boxes that a vehicle sends.
@@ -268,7 +269,6 @@ impl Arguments {
             loss: LossConfig {
                 unassigned,
                 alignment_weight: self.alignment_weight,
-                ..LossConfig::default()
             },
         })
     }

@@ -114,17 +114,17 @@ fn moment(
     for (number, method) in methods.iter_mut().enumerate() {
         let prepared = vehicles.iter().map(|it| prepare(method.as_mut(), it));
         let prepared = prepared.collect::<Result<Vec<_>, _>>()?;
-        let Some((own, neighbours)) = prepared.split_first() else {
+        let Some(((own, _, own_time), neighbours)) = prepared.split_first() else {
             continue;
         };
-        for (received, &index) in neighbours.iter().zip(&near[1..]) {
+        for ((message, bytes, time), &index) in neighbours.iter().zip(&near[1..]) {
             let start = Instant::now();
-            let found = method.align(&vehicles[0], &own.message, &received.message);
-            let time = own.time.max(received.time) + start.elapsed();
+            let found = method.align(&vehicles[0], own, message);
+            let time = *own_time.max(time) + start.elapsed();
             let off = found.map(|found| ego_from[index].inv_mul(&found));
             on_outcome(PairOutcome {
                 method: number,
-                bytes: received.bytes,
+                bytes: *bytes,
                 time,
                 result: off.map(|off| PairError {
                     metres: off.translation.vector.norm(),
@@ -137,26 +137,16 @@ fn moment(
 }
 
 /// A vehicle's message, its size and its preparation time.
-struct PreparedMessage {
-    message: Message,
-    bytes: u64,
-    time: Duration,
-}
-
 fn prepare(
     method: &mut dyn AlignmentMethod,
     vehicle: &AlignInput<'_>,
-) -> Result<PreparedMessage, AlignError> {
+) -> Result<(Message, u64, Duration), AlignError> {
     let start = Instant::now();
     let message = method.prepare(vehicle)?;
     let time = start.elapsed();
     let stamp = stamp(&vehicle.frame.cav, vehicle.frame.capture_nanos);
     let bytes = wire::encode_any(&stamp, message.clone())?.wire_bytes() - HEADER_LEN;
-    Ok(PreparedMessage {
-        message,
-        bytes: bytes as u64,
-        time,
-    })
+    Ok((message, bytes as u64, time))
 }
 
 /// A vehicle's boxes in the frame of its LiDAR, the most confident first.

@@ -5,8 +5,8 @@ use std::path::{Path, PathBuf};
 
 use agent::attack::AttackConfig;
 use agent::config::{AgentSettings, ModelConfig};
-use dataset::Scenario;
 use dataset::evaluation_protocol::EvaluationProtocol;
+use dataset::{Scenario, Tick};
 use ego_fuser::config::EgoSettings;
 use ego_fuser::ego_loop::LoopOptions;
 use ego_fuser::pairing::PairingConfig;
@@ -14,6 +14,7 @@ use fusion::method::Method;
 use link::{LatencyModel, LinkConfig, LinkEmulator, LinkError};
 use protocol::CavId;
 use support::random::scenario_seed;
+use support::statistics;
 
 use super::stepped::ComputeTimes;
 
@@ -30,10 +31,11 @@ pub struct Setup {
     pub vehicles: BTreeMap<CavId, AgentSettings>,
     /// Attacking neighbours; absent: none.
     pub attack: Option<AttackConfig>,
-    /// Misbehaviour detection of the ego, and over a link its limits. `id` is not read.
+    /// Misbehaviour detection of the ego, and its limits: the deadline over a link alone. `id` is not read.
     pub ego: EgoSettings,
     /// Link emulation in simulation time. Absent: all messages arrive `delay_ms` after their sweep; the ego waits for
-    /// none and fuses those of the newest tick; computing takes no time, and nothing is counted.
+    /// none and fuses the newest of each neighbour, up to `ego.max_age_ms` on top of the delay; computing takes no time,
+    /// and nothing is counted.
     pub link: Option<EmulatedLink>,
     /// Delay of the messages of neighbours without a link, milliseconds.
     pub delay_ms: u64,
@@ -112,13 +114,9 @@ impl Setup {
         if self.link.is_some() {
             return options;
         }
-        // Younger than the messages of the tick before the newest that has arrived.
-        let steps = scenario.ticks.windows(2);
-        let longest = steps.map(|pair| pair[1].capture_nanos.saturating_sub(pair[0].capture_nanos));
-        let max_age_nanos = match self.delay_ms.saturating_mul(1_000_000) {
-            0 => 0,
-            delay => delay.saturating_add(longest.max().unwrap_or(1).saturating_sub(1)),
-        };
+        let delay_nanos = self.delay_ms.saturating_mul(1_000_000);
+        let live_nanos = options.pairing.max_age_nanos;
+        let max_age_nanos = max_age_nanos(delay_nanos, live_nanos, &scenario.ticks);
         LoopOptions {
             // The ego waits for none, and takes none that was captured after its own sweep.
             deadline_nanos: 0,
@@ -129,6 +127,19 @@ impl Setup {
             ..options
         }
     }
+}
+
+/// Largest age of a message that arrives after a constant delay: that of a live run on top of the delay. Where sweeps are
+/// rarer, less than a step on top of it: a late message is not one that a neighbour lacks. All nanoseconds.
+fn max_age_nanos(delay_nanos: u64, live_nanos: u64, ticks: &[Tick]) -> u64 {
+    if delay_nanos == 0 {
+        return live_nanos;
+    }
+    let step = |pair: &[Tick]| pair[1].capture_nanos.saturating_sub(pair[0].capture_nanos) as f64;
+    let steps = ticks.windows(2).map(step);
+    // A pause in the recording must not make every map young enough.
+    let step_nanos = statistics::median(&Vec::from_iter(steps)).unwrap_or(0.0) as u64;
+    delay_nanos.saturating_add(live_nanos.max(step_nanos.saturating_sub(1)))
 }
 
 impl AgentPool {
@@ -145,5 +156,30 @@ impl AgentPool {
                 (places.collect(), Vec::new())
             }
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const MS: u64 = 1_000_000;
+
+    #[test]
+    fn a_pause_in_a_recording_makes_no_old_map_young_enough() {
+        let of = |delay_ms: u64, captures_ms: &[u64]| {
+            let ticks = captures_ms.iter().map(|capture_ms| Tick {
+                stem: capture_ms.to_string(),
+                capture_nanos: capture_ms * MS,
+            });
+            max_age_nanos(delay_ms * MS, 150 * MS, &Vec::from_iter(ticks))
+        };
+        // The limit of a live run, as over a link.
+        assert_eq!(of(0, &[0, 100, 200]), 150 * MS);
+        assert_eq!(of(0, &[0, 500, 1000]), 150 * MS);
+        assert_eq!(of(100, &[0, 100, 200, 300, 5300]), 250 * MS);
+        // At 2 Hz a map of the tick before has just arrived, and one of two ticks before is too old.
+        assert_eq!(of(500, &[0, 500, 1000, 1500, 9000]), 1000 * MS - 1);
+        assert_eq!(of(100, &[0]), 250 * MS);
     }
 }

@@ -1,7 +1,7 @@
 //! Sweeps of one tick: the frames of all agents that take part, with their kept feature maps.
 
 use dataset::frame::Frame;
-use dataset::{LeftOut, LoadOptions, Problem, ReadError, Scenario};
+use dataset::{LoadOptions, Problem, ReadError, Scenario};
 use protocol::CavId;
 use tch::Tensor;
 
@@ -60,13 +60,6 @@ impl Evaluator {
         Ok(sweeps)
     }
 
-    /// Adds the problems found when the data set was opened to the data that were left out, and findings about the
-    /// rest.
-    pub fn add_data_set(&mut self, problems: &[ReadError], findings: Vec<Problem>) {
-        self.left_out.add_files(problems);
-        self.left_out.add_findings(findings);
-    }
-
     /// Counts a frame of an agent that could not be computed, with its reason.
     pub(super) fn count_failure(
         &mut self,
@@ -78,11 +71,6 @@ impl Evaluator {
         let stem = scenario.ticks.get(tick).map_or("", |tick| &tick.stem);
         let frame = format!("scenario {}, tick {stem}, agent {cav}", scenario.name);
         self.left_out.add_failed(&frame, reason);
-    }
-
-    /// Data that were left out so far.
-    pub fn left_out(&self) -> &LeftOut {
-        &self.left_out
     }
 }
 

@@ -88,11 +88,11 @@ impl SweepEncoder {
             zstd_level: Some(ZSTD_LEVEL),
             ..CodecConfig::default()
         };
-        // Sender and time of a map follow from its index.
+        // Sender and time of a map follow from its index, by which its record is known again.
         let stamp = Stamp {
             cav: CavId::new("0").at(&self.path)?,
             epoch: 0,
-            sequence: 0,
+            sequence: sweep as u64,
             capture_nanos: 0,
             publish_nanos: 0,
         };

@@ -133,24 +133,17 @@ struct RawView {
 
 impl SampleBuilder {
     /// A builder over `scenes` of samples for a model.
-    ///
-    /// # Errors
-    /// [`Error::AnchorGrid`] when the anchors of the model are not on a grid.
-    pub fn new(
-        scenes: Arc<SceneSet>,
-        config: SampleConfig,
-        model: &CooperativeModel,
-    ) -> Result<Self> {
+    pub fn new(scenes: Arc<SceneSet>, config: SampleConfig, model: &CooperativeModel) -> Self {
         let detector = model.config();
-        Ok(Self {
+        Self {
             scenes,
             config,
             lidar_range_m: detector.lidar_range_m,
-            assigner: Arc::new(model.assigner()?),
+            assigner: Arc::new(model.assigner()),
             crop: Crop::for_detector(detector),
             voxeliser: Voxeliser::for_detector(detector),
             maps: None,
-        })
+        }
     }
 
     /// The sample of a tick, seen from a random vehicle.

@@ -75,7 +75,7 @@ impl Batch {
             }
             Views::Maps(maps) => {
                 let maps = maps.f_to_device(model.device())?;
-                let maps = model.network().through_compressor(&maps, train);
+                let maps = model.network.through_compressor(&maps, train);
                 model.fuse_and_detect(&maps, &self.facts, train)
             }
         }

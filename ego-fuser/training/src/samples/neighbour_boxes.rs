@@ -66,7 +66,7 @@ impl Batch {
         };
         let maps = maps.f_to_device(model.device())?;
         // Maps are stored as they are before the compressor.
-        let maps = model.network().through_compressor(&maps, false);
+        let maps = model.network.through_compressor(&maps, false);
         let mut first = 0;
         let (mut samples, mut refinement_losses) = (Vec::new(), Vec::new());
         for (facts, truth) in self.facts.iter().zip(&self.truth) {

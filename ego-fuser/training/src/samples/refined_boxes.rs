@@ -31,9 +31,9 @@ pub(super) fn refined_boxes(
     truth: &GroundTruth,
 ) -> Result<(Vec<Detection>, Option<Tensor>), Error> {
     let limits = PostprocessConfig::for_late_fusion(model.config());
-    let heads = tch::no_grad(|| model.network().heads(map))?;
+    let heads = tch::no_grad(|| model.network.heads(map))?;
     let found = model.detections(&heads, &limits)?.pop().unwrap_or_default();
-    let Some(refinement) = model.refinement().filter(|_| !found.is_empty()) else {
+    let Some(refinement) = model.refinement.as_ref().filter(|_| !found.is_empty()) else {
         return Ok((found, None));
     };
     let corrections = refinement.corrections(map, &found)?;

@@ -110,6 +110,6 @@ pub(super) fn card(
         ));
     }
     card.configuration(detector);
-    card.configuration_json(&model.fusion().config().to_json_pretty());
+    card.configuration_json(&model.fusion.config().to_json_pretty());
     card
 }

@@ -65,7 +65,7 @@ impl<'a> FrozenEncoder<'a> {
 /// Sample settings for a model: as many time steps as its fusion needs, and no rotation where maps are stored.
 pub(super) fn sample_config(config: &TrainConfig, model: &CooperativeModel) -> SampleConfig {
     let mut samples = config.samples.clone();
-    samples.moments.frames = model.fusion().requirements().history.frames;
+    samples.moments.frames = model.fusion.requirements.history.frames;
     if config.frozen_encoder.is_some() {
         samples.augmentation = Augmentation::OFF;
     }

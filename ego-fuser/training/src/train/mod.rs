@@ -107,12 +107,12 @@ impl<'a> FusionTraining<'a> {
         model.set_precision(run.precision);
         let (options, protocol) = (&config.open, &config.protocol);
         let scenes = Arc::new(SceneSet::open(&config.data, options, protocol)?);
-        let mut builder = SampleBuilder::new(Arc::clone(&scenes), samples.clone(), &model)?;
+        let mut builder = SampleBuilder::new(Arc::clone(&scenes), samples.clone(), &model);
         let mut validator = None;
         if !config.validation.is_empty() {
             let scenes = SceneSet::open(&config.validation, options, protocol)?;
             let frames = config.validation_frames;
-            validator = Some(Validator::open(scenes, &samples, &model, frames)?);
+            validator = Some(Validator::new(scenes, &samples, &model, frames));
         }
         if let Some(frozen) = &frozen {
             frozen.give_maps(&mut builder, observe)?;
@@ -126,7 +126,7 @@ impl<'a> FusionTraining<'a> {
             .on_data(&scenes.data().sha256)?;
         let curve = DetectorCurve::open(&trainer)?;
         observe(&TrainingEvent::Read(scenes.data()));
-        let pillar_grid = model.network().pillar_grid;
+        let pillar_grid = model.network.pillar_grid;
         let training = Self {
             config,
             observe,
@@ -195,7 +195,7 @@ impl Task for FusionTraining<'_> {
             rng.set_stream(trainer.steps());
             let (samples, refinement) = batch.with_boxes(&self.model, Some(&mut rng))?;
             let head = self.model.detect_with_boxes(&samples)?;
-            let terms = detection_loss(&head.scores, &head.offsets, &labels, config)?;
+            let terms = detection_loss(&head.scores, &head.offsets, &labels)?;
             let vehicles = refinement.len().max(1) as f64;
             let refinement: Tensor = refinement.iter().sum();
             let total = terms.total() + refinement / vehicles;
@@ -204,7 +204,7 @@ impl Task for FusionTraining<'_> {
         }
         let output = batch.output(&self.model, true)?;
         let head = &output.head;
-        let terms = detection_loss(&head.scores, &head.offsets, &labels, config)?;
+        let terms = detection_loss(&head.scores, &head.offsets, &labels)?;
         let total = match config.alignment_weight {
             weight if weight > 0.0 => {
                 terms.total() + alignment_loss(&output.corrections, &batch.offsets)? * weight

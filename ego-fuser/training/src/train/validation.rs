@@ -35,15 +35,12 @@ pub(crate) struct Validator {
 
 impl Validator {
     /// Chooses `frames` ticks of `scenes`, evenly spread.
-    ///
-    /// # Errors
-    /// [`Error`] when a folder cannot be read.
-    pub(crate) fn open(
+    pub(crate) fn new(
         scenes: SceneSet,
         samples: &SampleConfig,
         model: &CooperativeModel,
         frames: usize,
-    ) -> Result<Self, Error> {
+    ) -> Self {
         let scenes = Arc::new(scenes);
         let ticks = evenly_spread(&scenes.ticks, frames.max(1));
         let mut samples = samples.clone();
@@ -52,8 +49,8 @@ impl Validator {
         (samples.poses.noise, samples.poses.lost_share) = (None, 0.0);
         (samples.moments.max_delay_nanos, samples.moments.gap) = (0, 1);
         samples.merged_truth = true;
-        let builder = SampleBuilder::new(scenes, samples, model)?;
-        Ok(Self { builder, ticks })
+        let builder = SampleBuilder::new(scenes, samples, model);
+        Self { builder, ticks }
     }
 
     /// AP of `model` now; `with_boxes`: neighbours send boxes in place of maps.
@@ -75,7 +72,7 @@ impl Validator {
             let mut truth = sample.truth.clone();
             let (objects, area_m) = (&mut truth.objects, truth.area_m);
             objects.retain(|object| corners_within(&object.box3d.corners(), area_m));
-            let batch = Batch::collate(vec![sample], &model.network().pillar_grid)?;
+            let batch = Batch::collate(vec![sample], &model.network.pillar_grid)?;
             let head = no_grad(|| match with_boxes {
                 true => {
                     let (samples, _) = batch.with_boxes(model, None::<&mut ChaCha8Rng>)?;

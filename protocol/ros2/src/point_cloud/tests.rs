@@ -324,13 +324,8 @@ fn a_wrong_message_is_named_with_field_and_values() {
         .to_string();
     assert!(error.starts_with("data at byte "), "{error}");
     for bytes in [&[][..], &[0, 1], &[0, 3, 0, 0, 1], &[9; 40]] {
-        assert!(
-            matches!(
-                read_point_cloud(bytes, &LIMITS),
-                Err(ReadError::Encoding(_))
-            ),
-            "{bytes:?}"
-        );
+        let error = read_point_cloud(bytes, &LIMITS).unwrap_err().to_string();
+        assert!(error.starts_with("encoding "), "{bytes:?}: {error}");
     }
 }
 

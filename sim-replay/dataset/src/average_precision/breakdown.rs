@@ -5,7 +5,7 @@ use std::fmt;
 use protocol::{Box3d, Detection};
 
 use crate::frame::ObjectClass;
-use crate::ground_truth::{GroundTruth, TrueBox};
+use crate::ground_truth::GroundTruth;
 
 /// Edges of the bins of distance, metres, as in V2V4Real's tables.
 const DISTANCE_EDGES_M: [f64; 4] = [0.0, 30.0, 50.0, 100.0];
@@ -37,25 +37,20 @@ impl Breakdown {
     }
 
     pub(super) fn selection(self, detections: &[Detection], truth: &GroundTruth) -> PartMembers {
-        let found = detections.iter();
+        let (objects, found) = (truth.objects.iter(), detections.iter());
+        let objects = objects.map(|one| self.has(&one.box3d, Some(one.class)));
         PartMembers {
-            objects: truth.objects.iter().map(|one| self.has(one)).collect(),
-            detections: found.map(|one| self.has_place(&one.box3d)).collect(),
+            objects: objects.collect(),
+            detections: found.map(|one| self.has(&one.box3d, None)).collect(),
         }
     }
 
-    fn has(self, object: &TrueBox) -> bool {
-        match self {
-            Self::Distance(_) => self.has_place(&object.box3d),
-            Self::Class(class) => object.class == class,
-        }
-    }
-
-    fn has_place(self, box3d: &Box3d) -> bool {
+    /// True for a box of the part; one without a class is of every class.
+    fn has(self, box3d: &Box3d, class: Option<ObjectClass>) -> bool {
         let [x, y, _] = box3d.center_m;
         match self {
             Self::Distance([from_m, to_m]) => (from_m..to_m).contains(&x.hypot(y)),
-            Self::Class(_) => true,
+            Self::Class(own) => class.is_none_or(|class| class == own),
         }
     }
 }

@@ -37,7 +37,7 @@ fn matches_are_those_that_are_counted() {
         [[wrong, Verdict::Match(1), wrong, Verdict::Match(0)]]
     );
     assert_eq!(
-        scorer.tallies()[0]
+        scorer.tallies[0]
             .matched
             .iter()
             .filter(|matched| matched.is_true)
@@ -65,7 +65,7 @@ fn a_second_box_on_one_object_is_false() {
         &[found(0.1, 0.8), found(0.0, 0.9)],
         &GroundTruth::of_boxes([car(0.0)]),
     );
-    let is_true: Vec<bool> = scorer.tallies()[0]
+    let is_true: Vec<bool> = scorer.tallies[0]
         .matched
         .iter()
         .map(|entry| entry.is_true)
@@ -81,12 +81,7 @@ fn the_loser_of_the_best_object_may_still_find_another() {
         &[found(0.0, 0.9), found(0.6, 0.8)],
         &GroundTruth::of_boxes([car(0.2), car(2.0)]),
     );
-    assert!(
-        scorer.tallies()[0]
-            .matched
-            .iter()
-            .all(|entry| entry.is_true)
-    );
+    assert!(scorer.tallies[0].matched.iter().all(|entry| entry.is_true));
 }
 
 #[test]
@@ -300,7 +295,7 @@ fn ap_by_distance_and_by_class_is_that_of_a_plain_computation() {
     for (found, truth) in &frames {
         scorer.add(found, truth);
     }
-    for (part, tallies) in scorer.parts() {
+    for (part, tallies) in &scorer.parts {
         let expected = match *part {
             Breakdown::Distance([from, to]) => {
                 let is_near = |x: f64| (from..to).contains(&x);

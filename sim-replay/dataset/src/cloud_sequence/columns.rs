@@ -26,13 +26,6 @@ pub(super) enum PoseColumns {
     Matrix(usize),
 }
 
-impl PoseColumns {
-    /// TUM's order, from a column on.
-    fn in_order(first: usize) -> Self {
-        Self::Quaternion(std::array::from_fn(|value| first + value))
-    }
-}
-
 /// Columns of the time.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) enum TimeColumns {
@@ -86,16 +79,11 @@ impl Columns {
     /// # Errors
     /// A sentence if no form has so many columns.
     pub(super) fn of_width(width: usize) -> Result<Self, String> {
-        let (pose, key, time) = match width {
-            7 => (PoseColumns::in_order(0), None, None),
-            8 => (PoseColumns::in_order(1), Some(0), None),
-            9 => (
-                PoseColumns::in_order(2),
-                None,
-                Some(TimeColumns::SecondsAndNanos(0, 1)),
-            ),
-            12 | 16 => (PoseColumns::Matrix(0), None, None),
-            13 | 17 => (PoseColumns::Matrix(1), Some(0), None),
+        // The seven values of a quaternion's row are the last.
+        let pose = match width {
+            7..=9 => PoseColumns::Quaternion(std::array::from_fn(|value| width - 7 + value)),
+            12 | 16 => PoseColumns::Matrix(0),
+            13 | 17 => PoseColumns::Matrix(1),
             _ => return Err(format!("{width} values, expected 7, 12 or 16, or one more")),
         };
         Ok(Self {
@@ -103,8 +91,8 @@ impl Columns {
             pose,
             name: None,
             number: None,
-            time,
-            key,
+            time: (width == 9).then_some(TimeColumns::SecondsAndNanos(0, 1)),
+            key: matches!(width, 8 | 13 | 17).then_some(0),
         })
     }
 
@@ -140,9 +128,8 @@ fn place_of(roles: &[ColumnRole], wanted: ColumnRole) -> Option<usize> {
 
 /// Seconds and nanoseconds, or the first column that is a time.
 fn time_of(roles: &[ColumnRole]) -> Option<TimeColumns> {
-    let [seconds, nanos] =
-        [ColumnRole::Seconds, ColumnRole::Nanos].map(|role| place_of(roles, role));
-    if let (Some(seconds), Some(nanos)) = (seconds, nanos) {
+    let seconds = place_of(roles, ColumnRole::Seconds);
+    if let Some((seconds, nanos)) = seconds.zip(place_of(roles, ColumnRole::Nanos)) {
         return Some(TimeColumns::SecondsAndNanos(seconds, nanos));
     }
     (0..).zip(roles).find_map(|(column, role)| match role {

@@ -16,6 +16,8 @@ pub(super) struct Join {
     pub(super) rows: Vec<Option<usize>>,
     /// The property by which they were joined.
     pub(super) by: &'static str,
+    /// True if the clouds were taken for the beginning of a longer list, by their numbers alone.
+    pub(super) is_beginning: bool,
 }
 
 impl Join {
@@ -23,6 +25,7 @@ impl Join {
         Self {
             rows: rows.collect(),
             by,
+            is_beginning: false,
         }
     }
 }
@@ -126,12 +129,10 @@ fn by_order(count: usize, clouds: &Keys, poses: &PoseFile, have: &str) -> Result
             "the order of the clouds is not known, since their names are no numbers; {keys}"
         ));
     }
-    if poses.keys.iter().any(|keys| matches!(keys, Keys::Names(_))) {
+    if poses.has_names() {
         return Err(format!("{have} the name of a pose; {keys}"));
     }
-    if let Some(times) = poses.times()
-        && times.windows(2).any(|pair| pair.first() > pair.last())
-    {
+    if poses.times().is_some_and(|times| !times.is_sorted()) {
         return Err(format!(
             "the times of the poses are not in order, so rows cannot be assigned to clouds; {keys}"
         ));
@@ -147,13 +148,9 @@ fn by_order(count: usize, clouds: &Keys, poses: &PoseFile, have: &str) -> Result
     if let Some(joined) = by_line(clouds, rows) {
         return Ok(joined);
     }
-    let numbers = match rows == count {
-        true => "the numbers of the clouds have gaps",
-        false => "their numbers differ",
-    };
     Err(format!(
-        "{rows} poses for {count} clouds, {numbers}, and {have} the name, number or time of a pose: lines cannot be \
-         assigned; {keys}"
+        "{rows} poses for {count} clouds, or gaps between the clouds, and {have} the name, number or time of a pose: \
+         lines cannot be assigned; {keys}"
     ))
 }
 
@@ -180,16 +177,21 @@ fn is_without_gap(clouds: &Keys, times: Option<&[u64]>) -> bool {
     })
 }
 
-/// Clouds that are numbered as the rows are, from 0 or 1 to the last: the number is that of the row.
+/// Clouds that are numbered as the rows are: the number is that of the row. The last cloud has the last row; or clouds
+/// are numbered from 0, and at least half of the rows have one.
 fn by_line(clouds: &Keys, rows: usize) -> Option<Join> {
     let Keys::Numbers(numbers) = clouds else {
         return None;
     };
     let (first, last) = (*numbers.first()?, *numbers.last()?);
     let is_of_rows = first <= 1 && (last + 1).checked_sub(first) == Some(rows as u64);
+    let is_beginning = first == 0 && last + 1 < rows as u64 && 2 * numbers.len() >= rows;
     let places = numbers.iter();
     let places = places.map(|number| usize::try_from(number - first).ok());
-    is_of_rows.then(|| Join::new("number of the row", places))
+    (is_of_rows || is_beginning).then(|| Join {
+        is_beginning,
+        ..Join::new("number of the row", places)
+    })
 }
 
 /// True if both lists of times have the same intervals: their clocks differ by a constant only.
@@ -219,7 +221,7 @@ mod tests {
         keys: Vec<Keys>,
         count: usize,
     ) -> Result<(Vec<usize>, &'static str), String> {
-        let Join { rows, by } = join(stems, &Keys::of_stems(stems), &poses(keys, count))?;
+        let Join { rows, by, .. } = join(stems, &Keys::of_stems(stems), &poses(keys, count))?;
         Ok((rows.into_iter().map(|row| row.unwrap_or(99)).collect(), by))
     }
 
@@ -235,7 +237,7 @@ mod tests {
     #[test]
     fn rows_belong_to_clouds_by_key_or_by_a_proven_order() {
         type Case<'a> = (&'a [&'a str], Vec<Keys>, usize, &'a [usize], &'a str);
-        let cases: [Case<'_>; 11] = [
+        let cases: [Case<'_>; 12] = [
             (
                 &["1", "2"],
                 vec![Keys::Numbers(vec![2, 1])],
@@ -274,6 +276,7 @@ mod tests {
             ),
             (&["0", "2"], vec![], 3, &[0, 2], "number of the row"),
             (&["1", "3"], vec![], 3, &[0, 2], "number of the row"),
+            (&["0", "1", "3"], vec![], 6, &[0, 1, 3], "number of the row"),
             (
                 &["7.1", "7.2"],
                 times_in_tenths(&[71, 99, 72]),
@@ -320,7 +323,7 @@ mod tests {
                 &["0", "2", "3"],
                 vec![],
                 3,
-                "the numbers of the clouds have gaps",
+                "3 poses for 3 clouds, or gaps between the clouds",
             ),
             (
                 &["first", "second"],

@@ -9,13 +9,15 @@ mod columns;
 mod join;
 mod pose_file;
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashSet};
+use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
 
 use self::join::join;
 use self::pose_file::PoseFile;
 use super::faults::Faults;
-use super::keys::Keys;
+use super::frame_files::{named_once, usual_stems};
+use super::keys::{Keys, LEAST_PER_STRAY};
 use super::layout::{LayoutReader, LayoutRow};
 use super::points::{SweepStorage, clouds_in};
 use super::{Layout, OpenOptions, ReadError, Result, Scenario, Tick, files, sequence, time_stamps};
@@ -68,32 +70,25 @@ fn place_of(dir: &Path) -> Option<(PathBuf, Vec<PathBuf>)> {
 }
 
 fn open(dir: &Path, options: &OpenOptions, problems: &mut Vec<ReadError>) -> Result<Scenario> {
-    let (path, mut files) =
+    let (path, files) =
         place_of(dir).ok_or_else(|| ReadError::malformed(dir, "no clouds with poses"))?;
     let mut faults = Faults::default();
     let poses = PoseFile::read(&path, &mut faults)?;
-    // Natural order compares fractions as whole numbers: 1.5 would come before 1.25.
-    if let Keys::Times(times) = Keys::of_stems(&stems_of(&files)) {
-        let mut timed: Vec<(u64, PathBuf)> = times.into_iter().zip(files).collect();
-        timed.sort();
-        files = timed.into_iter().map(|(_, file)| file).collect();
-    }
+    let files = in_order(files, &poses, problems)?;
     let stems = stems_of(&files);
     let keys = Keys::of_stems(&stems);
-    // Refuses two clouds of one number, time or stem: one pose cannot be that of both.
-    // The files are in order, so equal keys are neighbours.
-    for ([first, second], index) in files.array_windows().zip(0..) {
-        if keys.are_equal(index, index + 1) {
-            let reason = format!(
-                "has the number, time or name of {}: a pose cannot be that of both",
-                first.display()
-            );
-            return Err(ReadError::malformed(second, reason));
-        }
-    }
     let joined =
         join(&stems, &keys, &poses).map_err(|reason| ReadError::malformed(&path, reason))?;
     faults.report("pose", problems);
+    let (rows, used) = (poses.poses.len(), joined.rows.iter().flatten().count());
+    if joined.is_beginning {
+        let numbers = keys.shown();
+        let reason = format!(
+            "{rows} poses for clouds with {numbers}: those beyond the last cloud are not used, and clouds that were \
+             numbered anew have poses of others"
+        );
+        problems.push(ReadError::malformed(&path, reason));
+    }
     let mut timed = BTreeMap::new();
     let mut without = Faults::default();
     for (index, ((file, stem), row)) in files.iter().zip(&stems).zip(&joined.rows).enumerate() {
@@ -108,8 +103,8 @@ fn open(dir: &Path, options: &OpenOptions, problems: &mut Vec<ReadError>) -> Res
             // Without a time in its name a cloud has that of its pose.
             Keys::Numbers(_) | Keys::Names(_) => row.and_then(|row| poses.times()?.get(row)),
         };
-        let nanos = nanos.copied();
-        let nanos = nanos.unwrap_or_else(|| options.period_nanos.saturating_mul(keys.count(index)));
+        let counted = || options.period_nanos.saturating_mul(keys.count(index));
+        let nanos = nanos.copied().unwrap_or_else(counted);
         let tick = Tick::new(*stem, nanos);
         let cloud = (tick, file.clone(), Some(world_from_lidar));
         // The index keeps clouds of equal times apart.
@@ -121,13 +116,76 @@ fn open(dir: &Path, options: &OpenOptions, problems: &mut Vec<ReadError>) -> Res
         problems.extend(time_stamps::step_problem(&path, &nanos));
     }
     let of_poses = path.file_name().unwrap_or_default().display();
-    let join = format!("{} poses of {of_poses} by {}", timed.len(), joined.by);
+    let mut join = format!("{} poses of {of_poses} by {}", timed.len(), joined.by);
+    if used < rows {
+        join += &format!(", {} without cloud", rows - used);
+    }
     let clouds = timed.into_values().collect();
     let (layout, storage) = (Layout(&CLOUDS), SweepStorage::ByName);
     Ok(Scenario {
         joins: vec![join],
         ..sequence::scenario(layout, clouds, storage, vec![path], options)
     })
+}
+
+/// Clouds in the order of their times, or in natural order. At most one of ten is left out: names that are no numbers
+/// beside those that are, and further files of a number, time or stem.
+///
+/// # Errors
+/// [`ReadError`] for more further files: then it is not known which are wrong.
+fn in_order(
+    mut files: Vec<PathBuf>,
+    poses: &PoseFile,
+    problems: &mut Vec<ReadError>,
+) -> Result<Vec<PathBuf>> {
+    let folder = files.first().and_then(|file| file.parent());
+    let folder = folder.unwrap_or(Path::new(".")).to_owned();
+    report_unread(&folder, &files, problems);
+    let stems = stems_of(&files);
+    if !Keys::of_stems(&stems).have_one_form() && !poses.has_names() {
+        let (_, strays) = usual_stems(stems.into_iter().collect(), "");
+        if strays.len() * LEAST_PER_STRAY <= files.len() {
+            problems.extend(named_once(&folder, &strays));
+            let strays: HashSet<&OsStr> = strays.iter().map(OsStr::new).collect();
+            files.retain(|file| file.file_stem().is_none_or(|stem| !strays.contains(stem)));
+        }
+    }
+    // Natural order compares fractions as whole numbers: 1.5 would come before 1.25.
+    if let Keys::Times(times) = Keys::of_stems(&stems_of(&files)) {
+        let mut timed: Vec<(u64, PathBuf)> = times.into_iter().zip(files).collect();
+        timed.sort();
+        files = timed.into_iter().map(|(_, file)| file).collect();
+    }
+    let keys = Keys::of_stems(&stems_of(&files));
+    // The files are in order, so equal keys are neighbours.
+    let pairs = files.array_windows::<2>().zip(0..);
+    let doubles = pairs.filter(|(_, index)| keys.are_equal(*index, index + 1));
+    let doubles: Vec<[PathBuf; 2]> = doubles.map(|(pair, _)| pair.clone()).collect();
+    if let Some([first, second]) = doubles.first() {
+        let (count, first) = (doubles.len(), first.display());
+        let reason = format!("has the number, time or name of {first}: a pose is of one cloud");
+        let fault = ReadError::malformed(second, reason);
+        if count * LEAST_PER_STRAY > files.len() {
+            return Err(fault);
+        }
+        problems.push(fault.with_consequence(&format!("{count} such files are left out")));
+        files.retain(|file| !doubles.iter().any(|[_, second]| second == file));
+    }
+    Ok(files)
+}
+
+/// Reports clouds with another ending after their own, as compression adds it, where the cloud itself does not exist.
+fn report_unread(folder: &Path, clouds: &[PathBuf], problems: &mut Vec<ReadError>) {
+    let ending = clouds.first().and_then(|cloud| cloud.extension());
+    let mut unread = Faults::default();
+    for name in files::list(folder).unwrap_or_default().files {
+        let file = folder.join(name);
+        let cloud = file.with_extension("");
+        if cloud.extension() == ending && !cloud.is_file() {
+            unread.push(ReadError::malformed(&file, "no kind of cloud that is read"));
+        }
+    }
+    unread.report("file", problems);
 }
 
 fn stems_of(files: &[PathBuf]) -> Vec<&str> {
@@ -282,6 +340,58 @@ mod tests {
             message.contains("1.bin: has the number, time or name of"),
             "{message}"
         );
+    }
+
+    /// Joins and problems of twelve clouds with fewer or other files, and of `rows` poses.
+    fn joined(without: &[u8], others: &[&str], rows: usize) -> (Vec<String>, Vec<String>) {
+        let dir = tempfile::tempdir().unwrap();
+        let numbers = (0..12).filter(|number| !without.contains(number));
+        let names: Vec<String> = numbers.map(|number| format!("{number:06}.bin")).collect();
+        let names: Vec<&str> = names.iter().map(String::as_str).collect();
+        clouds(dir.path(), &[&names[..], others].concat());
+        let dataset = open_with_poses(dir.path(), &"1 2 3 0 0 0 1\n".repeat(rows));
+        let root = format!("{}/", dir.path().display());
+        let problems = dataset.problems.iter();
+        let problems = problems.map(|problem| problem.to_string().replace(&root, ""));
+        (dataset.scenarios[0].joins.clone(), problems.collect())
+    }
+
+    #[test]
+    fn a_stray_file_is_left_out_and_named() {
+        for (other, expected) in [
+            (
+                "GlobalMap.bin",
+                "1 files whose names are no frame numbers are left out, first: GlobalMap",
+            ),
+            (
+                "000005 (1).bin",
+                "1 files whose names are no frame numbers are left out, first: 000005 (1)",
+            ),
+            (
+                "000003.npy",
+                "000003.npy: has the number, time or name of 000003.bin: a pose is of one cloud: 1 such files are left out",
+            ),
+            (
+                "000012.bin.gz",
+                "000012.bin.gz: no kind of cloud that is read: the file is left out",
+            ),
+        ] {
+            let (joins, problems) = joined(&[], &[other], 12);
+            assert_eq!(joins, ["12 poses of poses.txt by order"], "{other}");
+            assert_eq!(problems, [expected]);
+        }
+    }
+
+    #[test]
+    fn the_beginning_of_a_longer_list_is_named() {
+        let (joins, problems) = joined(&[10, 11], &[], 12);
+        let join = "10 poses of poses.txt by number of the row, 2 without cloud";
+        assert_eq!(joins, [join]);
+        let expected = "poses.txt: 12 poses for clouds with numbers 0 to 9: those beyond the last cloud are not used, and \
+                        clouds that were numbered anew have poses of others";
+        assert_eq!(problems, [expected]);
+        let (joins, problems) = joined(&[4, 5], &[], 12);
+        assert_eq!((joins, problems.len()), (vec![join.to_owned()], 0));
     }
 
     #[test]

@@ -58,6 +58,11 @@ impl PoseFile {
         })
     }
 
+    /// True if rows name their clouds.
+    pub(super) fn has_names(&self) -> bool {
+        (self.keys.iter()).any(|keys| matches!(keys, Keys::Names(_)))
+    }
+
     /// Times of all rows, nanoseconds.
     pub(super) fn times(&self) -> Option<&[u64]> {
         self.keys.iter().find_map(|keys| match keys {
@@ -203,15 +208,11 @@ impl<'a> FileRow<'a> {
     fn pose_at(&self, columns: &Columns) -> Result<Pose, String> {
         match &columns.pose {
             PoseColumns::Quaternion(places) => {
-                let mut values = [0.0; 7];
-                for (value, column) in values.iter_mut().zip(places) {
-                    *value = self.number(*column)?;
-                }
                 // TUM writes w last.
-                let [x, y, z, qx, qy, qz, qw] = values;
+                let [x, y, z, qx, qy, qz, qw] = places.map(|column| self.number(column));
                 let pose = Pose {
-                    translation_m: [x, y, z],
-                    rotation_wxyz: [qw, qx, qy, qz],
+                    translation_m: [x?, y?, z?],
+                    rotation_wxyz: [qw?, qx?, qy?, qz?],
                 };
                 poses::of_rounded(&pose).map(Pose::from)
             }

@@ -66,10 +66,8 @@ fn read_transform(path: &Path) -> Result<(Isometry3<f64>, [f64; 2])> {
     let transform = root.optional("transform")?.unwrap_or(root);
     let rotation = nearest_rotation(&transform.required("rotation")?)?;
     let translation = Translation3::from(transform.required("translation")?.numbers::<3>()?);
-    Ok((
-        Isometry3::from_parts(translation, rotation),
-        own_offset_m.unwrap_or_default(),
-    ))
+    let transform = Isometry3::from_parts(translation, rotation);
+    Ok((transform, own_offset_m.unwrap_or_default()))
 }
 
 /// The rotation nearest to a 3x3 matrix, row by row.

@@ -119,11 +119,8 @@ impl Index {
             }
         }
         faults.report("pair", problems);
-        groups.retain(|_, pairs| !pairs.is_empty());
-        let groups = groups.into_iter();
-        let groups = groups
-            .map(|(name, group)| (name, in_order(group)))
-            .collect();
+        let groups = groups.into_iter().filter(|(_, all)| !all.is_empty());
+        let groups = groups.map(|(name, all)| (name, in_order(all))).collect();
         Ok(Self { kind, groups })
     }
 }
@@ -226,8 +223,13 @@ fn checked_id(field: &JsonField<'_>, id: &str) -> Result<String> {
 /// readable time stamp the batch or sequence is kept.
 fn read_captures(path: &Path, kind: Kind, problems: &mut Vec<ReadError>) -> Captures {
     let (mut stamps, mut faults, mut groups) = (HashMap::new(), Faults::default(), Vec::new());
+    let (_, group_key) = kind.group();
     let read = json_table::read_all(path, MAX_BYTES, problems, |entry| {
-        let (id, group) = frame_and_group(entry, kind)?;
+        let id = match entry.optional("frame_id")? {
+            Some(id) => frame_id(&id)?,
+            None => stem(&entry.required("pointcloud_path")?)?,
+        };
+        let group = entry.optional_of(group_key, frame_id)?;
         let stamp = entry.required("pointcloud_timestamp");
         if let Some(stamp) = faults.take(stamp.and_then(|stamp| stamp.time())) {
             stamps.insert(id.clone(), stamp);
@@ -249,16 +251,6 @@ fn read_captures(path: &Path, kind: Kind, problems: &mut Vec<ReadError>) -> Capt
         (id, Capture { micros, group })
     });
     captures.collect()
-}
-
-/// Id of a frame, and its batch or sequence where the entry states one.
-fn frame_and_group(entry: &JsonField<'_>, kind: Kind) -> Result<(String, Option<String>)> {
-    let id = match entry.optional("frame_id")? {
-        Some(id) => frame_id(&id)?,
-        None => stem(&entry.required("pointcloud_path")?)?,
-    };
-    let (_, group_key) = kind.group();
-    Ok((id, entry.optional_of(group_key, frame_id)?))
 }
 
 /// `{delta_x, delta_y}` in metres. A missing one or an empty text is 0.

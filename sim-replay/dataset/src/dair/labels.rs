@@ -59,9 +59,13 @@ pub(super) fn in_frame(
     block: LabelList,
 ) -> Result<LabelledObjects> {
     read(path, block, |number, label| {
-        let Some(size_m) = size_m(&label.required("3d_dimensions")?)? else {
+        let dimensions = label.required("3d_dimensions")?;
+        let size_m = numbers_of(&dimensions, ["l", "w", "h"])?;
+        // Such labels have a box in the image alone.
+        if size_m.contains(&0.0) {
             return Ok(None);
-        };
+        }
+        let size_m = dimensions.checked_size(size_m)?;
         let location = label.required("3d_location")?;
         let [x, y, z] = numbers_of(&location, ["x", "y", "z"])?;
         let center = Translation3::new(x, y, z);
@@ -117,15 +121,6 @@ fn read(
         object.id = block.id(object.id);
     }
     Ok((objects, problems))
-}
-
-/// Length, width, height; nothing if one is 0: such labels have a box in the image alone.
-fn size_m(dimensions: &JsonField<'_>) -> Result<Option<[f64; 3]>> {
-    let size_m = numbers_of(dimensions, ["l", "w", "h"])?;
-    if size_m.contains(&0.0) {
-        return Ok(None);
-    }
-    dimensions.checked_size(size_m).map(Some)
 }
 
 fn numbers_of(field: &JsonField<'_>, keys: [&str; 3]) -> Result<[f64; 3]> {

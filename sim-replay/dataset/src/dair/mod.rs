@@ -63,7 +63,8 @@ const INFRASTRUCTURE: &str = "infrastructure";
 /// Opens the data sets at or below `dir`; `None` where there are none.
 pub(super) fn open(dir: &Path, options: &OpenOptions) -> Result<Option<Dataset>> {
     let root = files::above(dir).find(|above| is_root(above));
-    if let Some(root) = root.filter(|_| is_side(dir)) {
+    let parts = [VEHICLE_SIDE, INFRASTRUCTURE_SIDE, "cooperative"];
+    if let Some(root) = root.filter(|_| parts.iter().any(|part| dir.ends_with(part))) {
         let root = root.display();
         let reason = format!("this is a part of a DAIR-V2X data set: open {root}");
         return Err(ReadError::malformed(dir, reason));
@@ -81,11 +82,6 @@ pub(super) fn open(dir: &Path, options: &OpenOptions) -> Result<Option<Dataset>>
 fn is_root(dir: &Path) -> bool {
     let mut sides = [VEHICLE_SIDE, INFRASTRUCTURE_SIDE].iter();
     dir.join(index::COOPERATIVE).is_file() && sides.all(|side| dir.join(side).is_dir())
-}
-
-fn is_side(dir: &Path) -> bool {
-    let name = dir.file_name().and_then(|name| name.to_str());
-    name.is_some_and(|name| [VEHICLE_SIDE, INFRASTRUCTURE_SIDE, "cooperative"].contains(&name))
 }
 
 /// One scenario per batch or sequence.
@@ -243,15 +239,7 @@ struct DairSource {
 }
 
 impl DairSource {
-    fn pair(&self, tick: &Tick) -> Result<&FramePair> {
-        self.pairs.get(&tick.stem).ok_or_else(|| {
-            let reason = format!("no pair of vehicle frame {}", tick.stem);
-            ReadError::malformed(&self.sides.root, reason)
-        })
-    }
-
-    fn vehicle_frame(&self, agent: &CavId, tick: &Tick) -> Result<Frame> {
-        let pair = self.pair(tick)?;
+    fn vehicle_frame(&self, agent: &CavId, tick: &Tick, pair: &FramePair) -> Result<Frame> {
         let poses = calibration::vehicle(&self.sides, pair)?;
         let world_from_lidar = poses.world_from_lidar;
         let mut frame = Frame::empty(agent.clone(), tick.capture_nanos, Handedness::Right);
@@ -286,8 +274,7 @@ impl DairSource {
         list.is_ok_and(|(objects, _)| !objects.is_empty())
     }
 
-    fn infrastructure_frame(&self, agent: &CavId, tick: &Tick) -> Result<Frame> {
-        let pair = self.pair(tick)?;
+    fn infrastructure_frame(&self, agent: &CavId, tick: &Tick, pair: &FramePair) -> Result<Frame> {
         let world_from_lidar = calibration::infrastructure(&self.sides, pair)?;
         let mut frame = Frame::empty(agent.clone(), tick.capture_nanos, Handedness::Right);
         frame.world_from_lidar = Some(world_from_lidar.into());
@@ -316,9 +303,13 @@ fn usable(labels: Result<LabelledObjects>, problems: &mut Vec<Problem>) -> Optio
 
 impl FrameSource for DairSource {
     fn frame(&self, agent: &CavId, tick: &Tick) -> Result<Frame> {
+        let pair = self.pairs.get(&tick.stem).ok_or_else(|| {
+            let reason = format!("no pair of vehicle frame {}", tick.stem);
+            ReadError::malformed(&self.sides.root, reason)
+        })?;
         match PairSide::of(agent) {
-            PairSide::Vehicle => self.vehicle_frame(agent, tick),
-            PairSide::Infrastructure => self.infrastructure_frame(agent, tick),
+            PairSide::Vehicle => self.vehicle_frame(agent, tick, pair),
+            PairSide::Infrastructure => self.infrastructure_frame(agent, tick, pair),
         }
     }
 
@@ -346,10 +337,8 @@ impl FrameSource for DairSource {
     }
 
     fn points_path(&self, agent: &CavId, tick: &Tick, _variant: Option<&str>) -> PathBuf {
+        let points = |pair| self.sides.points(pair, PairSide::of(agent));
         // A tick of another scenario has no file here.
-        match self.pairs.get(&tick.stem) {
-            Some(pair) => self.sides.points(pair, PairSide::of(agent)),
-            None => self.sides.root.clone(),
-        }
+        self.pairs.get(&tick.stem).map(points).unwrap_or_default()
     }
 }

@@ -71,7 +71,17 @@ impl ProtocolConfig {
         let max_agents = self.max_agents.unwrap_or(protocol.max_agents);
         protocol.max_agents = checked("max_agents", max_agents, 1..=1000)?;
         protocol.agents = self.agent_kinds.unwrap_or(protocol.agents);
-        protocol.ego = self.ego_kind.unwrap_or(protocol.ego);
+        // Where all agents are of one kind, the ego is too.
+        let only = match protocol.agents {
+            AgentKinds::All => None,
+            AgentKinds::Vehicles => Some(EgoKind::Vehicle),
+            AgentKinds::Units => Some(EgoKind::Unit),
+        };
+        protocol.ego = self.ego_kind.or(only).unwrap_or(protocol.ego);
+        if only.is_some_and(|only| only != protocol.ego) {
+            let (ego, agents) = (protocol.ego, protocol.agents);
+            return Err(format!("ego_kind: {ego:?}, but agent_kinds: {agents:?}").to_lowercase());
+        }
         protocol.ap_order = self.ap_order.unwrap_or(protocol.ap_order);
         Ok(protocol)
     }

@@ -132,6 +132,14 @@ fn wrong_options_are_named_with_both_values() {
         refusal(r#"{"ground_truth_range_m": [1, 2]}"#),
         "ground_truth_range_m: 2 numbers, expected 6"
     );
+    assert_eq!(
+        refusal(r#"{"agent_kinds": "vehicles", "ego_kind": "unit"}"#),
+        "ego_kind: unit, but agent_kinds: vehicles"
+    );
+    assert_eq!(
+        refusal(r#"{"preset": "rcooper", "ego_kind": "vehicle"}"#),
+        "ego_kind: vehicle, but agent_kinds: units"
+    );
     let reversed = refusal(r#"{"ground_truth_range_m": [1, 0, 0, -1, 1, 1]}"#);
     assert_eq!(reversed, "ground_truth_range_m: from 1 to -1 is no range");
 }
@@ -175,17 +183,12 @@ fn a_scenario_without_agents_of_the_kind_is_left_out() {
     let dir = tempfile::tempdir().unwrap();
     agent(dir.path(), "1", 0..2);
     let scenario = crate::open(dir.path()).unwrap().scenarios.remove(0);
-    let units = ProtocolConfig {
-        agent_kinds: Some(AgentKinds::Units),
-        ..ProtocolConfig::default()
-    };
-    assert!(
-        units
-            .resolve(Layout::OPV2V)
-            .unwrap()
-            .arrange(&scenario)
-            .is_none()
-    );
+    for kinds in [r#"{"agent_kinds": "units"}"#, r#"{"ego_kind": "unit"}"#] {
+        let config: ProtocolConfig = serde_json::from_str(kinds).unwrap();
+        let protocol = config.resolve(Layout::OPV2V).unwrap();
+        assert_eq!(protocol.ego, EgoKind::Unit, "{kinds}");
+        assert!(protocol.arrange(&scenario).is_none(), "{kinds}");
+    }
 }
 
 #[test]

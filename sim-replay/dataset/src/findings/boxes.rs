@@ -24,6 +24,11 @@ const LEAST_LENGTH: f64 = 0.9;
 /// Length and width above which a vehicle is no car, metres. Buses and trucks are as long, but not as wide.
 const LONG_M: f64 = 7.0;
 const WIDE_M: f64 = 3.2;
+/// Largest distance of an agent's box from that of the same vehicle in a cooperative list, metres: half a car's length
+/// is more.
+const SAME_VEHICLE_M: f64 = 1.5;
+/// Vehicles that an agent lists for each one that the cooperative list has, too, at most: it holds nearly all of them.
+const MOST_PER_COMMON: usize = 10;
 const HINT: &str = "frames (axes, order of the pose's numbers) or units of the boxes may be wrong";
 
 /// The finding that agents list objects of the rule's classes, and none is ground truth of any ego. Without poses it
@@ -52,6 +57,39 @@ pub(super) fn without_ground_truth(
          {HINT}"
     );
     Some(Problem::about(&scenario.name, "ground truth", &reason))
+}
+
+/// The finding that the cooperative lists hold hardly any of the vehicles that an agent lists itself.
+pub(super) fn unlike_cooperative(
+    scenario: &str,
+    agent: &CavId,
+    ticks: &FramesOfTicks<'_>,
+) -> Option<Problem> {
+    let (mut own, mut common) = (0, 0);
+    for frames in ticks.values() {
+        let list = (frames.iter()).find_map(|frame| frame.cooperative_objects.as_ref());
+        let frame = frames.iter().find(|frame| frame.cav == *agent);
+        let Some((list, frame)) = list.zip(frame) else {
+            continue;
+        };
+        let vehicles = frame.objects.iter();
+        for vehicle in vehicles.filter(|object| ObjectClass::VEHICLES.contains(&object.class)) {
+            own += 1;
+            common += usize::from(list.iter().any(|other| is_near(vehicle, other)));
+        }
+    }
+    let reason = format!(
+        "agent {agent}: {common} of {own} vehicles that it lists are within {SAME_VEHICLE_M} m of one in the \
+         cooperative labels: these are of other frames or another world, or the agent's pose is wrong"
+    );
+    (own >= ENOUGH_BOXES.max(MOST_PER_COMMON * common))
+        .then(|| Problem::about(scenario, "cooperative labels", &reason))
+}
+
+fn is_near(one: &Object, other: &Object) -> bool {
+    let [[x, y, _], [other_x, other_y, _]] =
+        [one, other].map(|object| object.world_from_object.translation_m);
+    (x - other_x).hypot(y - other_y) < SAME_VEHICLE_M
 }
 
 /// True if there are objects whose place relative to the LiDAR is unknown.

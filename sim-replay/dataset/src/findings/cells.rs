@@ -10,7 +10,7 @@ const CELLS: usize = 40;
 const ACROSS: usize = 2 * CELLS;
 
 /// The points of a sweep, sorted by cell.
-pub(super) struct PointCells {
+pub(crate) struct PointCells {
     points: Vec<[f32; 3]>,
     /// Start of the points of each cell, and the end of the last.
     begins: Vec<usize>,
@@ -21,7 +21,7 @@ pub(super) struct PointCells {
     reason = "columns and rows are below ACROSS, begins has one for each cell and the end, axes are 0 to 2"
 )]
 impl PointCells {
-    pub(super) fn new(cloud: &PointCloud) -> Self {
+    pub(crate) fn new(cloud: &PointCloud) -> Self {
         let mut begins = vec![0; ACROSS * ACROSS + 1];
         for point in &cloud.xyzi {
             // Step: counting sort. One place behind, so that the sums are the beginnings.
@@ -42,7 +42,7 @@ impl PointCells {
 
     /// True if a box contains a point, once x and y of the points are multiplied by the signs; other arguments are its
     /// transform from the LiDAR frame and its half sizes.
-    pub(super) fn holds_point(
+    pub(crate) fn holds_point(
         &self,
         box_from_lidar: &Isometry3<f32>,
         half: [f32; 3],

@@ -3,7 +3,7 @@
 //! Inspection passes every frame; commands that report numbers print the findings of a sample ([`sampled`]).
 
 mod boxes;
-mod cells;
+pub(crate) mod cells;
 mod lists;
 mod sweeps;
 
@@ -111,6 +111,7 @@ fn of_objects(
         let read = frames.iter().flat_map(|(_, one)| &one.frame);
         let objects = read.flat_map(|frame| &frame.objects);
         problems.extend(boxes::unlike_cars(&scenario.name, id, objects));
+        problems.extend(boxes::unlike_cooperative(&scenario.name, id, &ticks));
     }
     problems.extend(rule.and_then(|rule| boxes::without_ground_truth(scenario, &ticks, rule)));
     problems

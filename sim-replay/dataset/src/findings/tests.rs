@@ -112,6 +112,33 @@ fn mirrored_points_are_named() {
 }
 
 #[test]
+fn cooperative_labels_of_another_world_are_named() {
+    let list = |offset_m: f64| -> Vec<Object> {
+        let place = |id: i64| protocol::Pose::from_xyz_yaw([offset_m, 9.0 * id as f64, 0.0], 0.0);
+        let cars = (0..25).map(|id| Object::new(id, ObjectClass::Car, place(id), [4.5, 1.8, 1.5]));
+        cars.collect()
+    };
+    let agent = CavId::new("vehicle").unwrap();
+    let finding = |cooperative_objects| {
+        let frame = Frame {
+            objects: list(0.0),
+            cooperative_objects,
+            ..Frame::empty(agent.clone(), 0, protocol::Handedness::Right)
+        };
+        let ticks = FramesOfTicks::from([(0, vec![&frame])]);
+        boxes::unlike_cooperative("scene", &agent, &ticks).map(|finding| finding.message)
+    };
+    assert_eq!(finding(None), None);
+    assert_eq!(finding(Some(list(1.0))), None);
+    let mut one_is_listed = list(2.0);
+    one_is_listed.extend(list(0.0).into_iter().take(3));
+    assert_eq!(finding(Some(one_is_listed)), None);
+    let found = finding(Some(list(2.0))).unwrap();
+    let start = "scene: agent vehicle: 0 of 25 vehicles that it lists are within 1.5 m of one in the cooperative";
+    assert!(found.starts_with(start), "{found}");
+}
+
+#[test]
 fn intensities_far_below_one_are_named() {
     let dir = tempfile::tempdir().unwrap();
     let found = scene_findings(dir.path(), 0, 0.0002, None);

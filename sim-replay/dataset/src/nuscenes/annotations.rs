@@ -3,11 +3,12 @@
 use std::collections::HashMap;
 use std::path::Path;
 
-use nalgebra::{Isometry3, Point3};
+use nalgebra::Isometry3;
 use protocol::PointCloud;
 
 use super::rows::{Indices, read_all, referred, transform};
 use super::samples::SceneSample;
+use crate::findings::cells::PointCells;
 use crate::frame::{Object, ObjectClass};
 use crate::json::JsonField;
 use crate::{ReadError, Result, classes};
@@ -51,26 +52,27 @@ fn read_instances(
     version: &Path,
     problems: &mut Vec<ReadError>,
 ) -> Result<HashMap<String, Instance>> {
-    let (mut names, mut unknown) = (HashMap::new(), Vec::new());
+    let (mut categories, mut unknown) = (HashMap::new(), Vec::new());
     read_all(version, "category.json", problems, |row| {
         let name = row.required("name")?;
-        if classes::of_name(name.text()?).is_none() && unknown.len() < MAX_UNKNOWN {
+        let class = classes::of_name(name.text()?);
+        if class.is_none() && unknown.len() < MAX_UNKNOWN {
             let shown: String = name.text()?.chars().take(40).collect();
             unknown.push(name.error(format!(
                 "{shown:?} is an unknown type of object: it counts as other, not as a vehicle"
             )));
         }
-        names.insert(row.required("token")?.id()?, name.text()?.to_owned());
+        let class = class.unwrap_or(ObjectClass::Other);
+        categories.insert(row.required("token")?.id()?, class);
         Ok(())
     })?;
     problems.append(&mut unknown);
     let mut instances = HashMap::new();
     read_all(version, "instance.json", problems, |row| {
         let category = row.required("category_token")?;
-        let name = names
+        let class = *categories
             .get(&category.id()?)
             .ok_or_else(|| category.error("no row of category.json has this token"))?;
-        let class = classes::of_name(name).unwrap_or(ObjectClass::Other);
         let id = instances.len() as i64;
         instances.insert(row.required("token")?.id()?, (id, class));
         Ok(())
@@ -92,13 +94,17 @@ fn object(row: &JsonField<'_>, instances: &HashMap<String, Instance>) -> Result<
 
 /// The objects that a sweep hits with at least one point. An object with the LiDAR inside or on its roof is the vehicle
 /// that carries it: a vehicle does not list itself.
-#[expect(clippy::indexing_slicing, reason = "axes of vectors of three")]
+#[expect(
+    clippy::indexing_slicing,
+    clippy::cast_possible_truncation,
+    reason = "axes of vectors of three, rounded to f32"
+)]
 pub(super) fn seen<'a>(
     objects: &'a [Object],
     points: &PointCloud,
     world_from_lidar: &Isometry3<f64>,
 ) -> impl Iterator<Item = &'a Object> {
-    let (points, world_from_lidar) = (points.xyzi.as_slice(), *world_from_lidar);
+    let (cells, world_from_lidar) = (PointCells::new(points), *world_from_lidar);
     objects.iter().filter(move |object| {
         let world_from_object = object.world_from_object.isometry();
         let object_from_lidar = world_from_object.inv_mul(&world_from_lidar);
@@ -107,22 +113,7 @@ pub(super) fn seen<'a>(
         let roof_m = [0.0, 0.0, MAX_MOUNT_M];
         // The mount is added at both ends of z: the test is symmetric about the centre of the box.
         let carries_lidar = (0..3).all(|axis| lidar[axis].abs() <= half_m[axis] + roof_m[axis]);
-        let reach_m = half_m.map(|half| half + HIT_MARGIN_M);
-        !carries_lidar && is_hit(points, &object_from_lidar, reach_m)
-    })
-}
-
-#[expect(clippy::indexing_slicing, reason = "axes of vectors of three")]
-fn is_hit(points: &[[f32; 4]], object_from_lidar: &Isometry3<f64>, half_m: [f64; 3]) -> bool {
-    let center = object_from_lidar.inverse().translation.vector;
-    let reach_m2 = half_m.iter().map(|half| half * half).sum::<f64>();
-    points.iter().any(|&[x, y, z, _]| {
-        let point = Point3::new(f64::from(x), f64::from(y), f64::from(z));
-        // Most points are far from any one box.
-        if (point.coords - center).norm_squared() > reach_m2 {
-            return false;
-        }
-        let local = object_from_lidar * point;
-        (0..3).all(|axis| local[axis].abs() <= half_m[axis])
+        let reach_m = half_m.map(|half| (half + HIT_MARGIN_M) as f32);
+        !carries_lidar && cells.holds_point(&object_from_lidar.cast(), reach_m, [1.0; 2])
     })
 }

@@ -78,7 +78,25 @@ pub(super) fn open(dir: &Path, options: &OpenOptions) -> Result<Option<Dataset>>
             Err(error) => problems.push(error),
         }
     }
+    leave_copies_out(&mut scenarios, &mut problems);
     opened(dir, scenarios, problems)
+}
+
+/// Leaves out the scenes whose first sweep is that of a scene before: versions of one root may share scenes.
+fn leave_copies_out(scenarios: &mut Vec<Scenario>, problems: &mut Vec<ReadError>) {
+    let mut names = HashMap::new();
+    scenarios.retain(|scenario| {
+        let Ok(path) = scenario.points_path(0, 0, None) else {
+            return true;
+        };
+        let known = names.insert(path.clone(), scenario.name.clone());
+        problems.extend(known.iter().map(|known| {
+            let again = &scenario.name;
+            let reason = format!("first sweep of scene {known}: scene {again}, too, is left out");
+            ReadError::malformed(&path, reason)
+        }));
+        known.is_none()
+    });
 }
 
 fn is_version(dir: &Path) -> bool {
@@ -164,25 +182,27 @@ impl SceneBuilder<'_> {
         }
         let capture_nanos = self.capture_times(&samples, options, problems);
         let (mut moments, mut missing, mut contents) = (Vec::new(), Vec::new(), HashMap::new());
-        for (sample, capture_nanos) in samples.into_iter().zip(capture_nanos) {
+        for (mut sample, capture_nanos) in samples.into_iter().zip(capture_nanos) {
             let mut channels = agents.iter().map(|(_, channel)| channel);
             // The first sweep in the order of the agents gives the name: the ego may lack one.
             let stem = channels.find_map(|channel| Some(sample.sweeps.get(channel)?.stem()));
-            let stem = stem.unwrap_or_else(|| sample.micros.to_string());
+            let mut stem = stem.unwrap_or_else(|| sample.micros.to_string());
+            // The files of several samples may have one name, in folders of their own.
+            if contents.contains_key(&stem) {
+                stem = format!("{stem}_{:06}", moments.len());
+            }
             let tick = Tick::new(stem, capture_nanos);
             let mut sweeps = HashMap::new();
             for (agent, channel) in &agents {
-                match sample.sweeps.get(channel) {
-                    Some(sweep) if self.root.join(&sweep.file).is_file() => {
-                        sweeps.insert(agent.clone(), sweep.clone());
+                if let Some(sweep) = sample.sweeps.remove(channel) {
+                    let path = self.root.join(&sweep.file);
+                    if path.is_file() {
+                        sweeps.insert(agent.clone(), sweep);
                         continue;
                     }
-                    Some(sweep) => {
-                        let reason =
-                            format!("does not exist: agent {agent} is absent at {}", tick.stem);
-                        problems.push(ReadError::malformed(&self.root.join(&sweep.file), reason));
-                    }
-                    None => {}
+                    let reason =
+                        format!("does not exist: agent {agent} is absent at {}", tick.stem);
+                    problems.push(ReadError::malformed(&path, reason));
                 }
                 missing.push(MissingFrame::new(agent, &tick.stem));
             }

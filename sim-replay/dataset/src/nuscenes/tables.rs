@@ -34,12 +34,8 @@ pub(super) struct Scene {
     pub(super) vehicles: Vec<String>,
 }
 
-/// A LiDAR on a vehicle.
-#[derive(Debug, Clone)]
-struct SensorMount {
-    channel: String,
-    vehicle_from_lidar: Isometry3<f64>,
-}
+/// The channel of a LiDAR, and the LiDAR's pose on its vehicle.
+type SensorMount = (String, Isometry3<f64>);
 
 /// A sweep before the pose of its vehicle is known.
 struct SweepRow {
@@ -88,10 +84,7 @@ fn read_mounts(
     let mut mounts = HashMap::new();
     read_all(version, "calibrated_sensor.json", problems, |row| {
         if let Some(channel) = channels.get(&row.required("sensor_token")?.id()?) {
-            let mount = SensorMount {
-                channel: channel.clone(),
-                vehicle_from_lidar: transform(row)?,
-            };
+            let mount = (channel.clone(), transform(row)?);
             mounts.insert(row.required("token")?.id()?, mount);
         }
         Ok(())
@@ -203,18 +196,19 @@ fn place(
                 continue;
             };
             let off_micros = row.micros.map(|micros| micros.abs_diff(sample.micros));
+            let (channel, vehicle_from_lidar) = row.mount;
             let sweep = SampleSweep {
                 file: row.file,
                 off_micros: off_micros.unwrap_or(u64::MAX),
                 world_from_vehicle,
-                vehicle_from_lidar: row.mount.vehicle_from_lidar,
+                vehicle_from_lidar,
             };
-            let known = sample.sweeps.get(&row.mount.channel);
+            let known = sample.sweeps.get(&channel);
             further += usize::from(known.is_some());
             // Of equally near ones the name decides, not the order of the table.
             let rank = |sweep: &SampleSweep| (sweep.off_micros, sweep.file.clone());
             if known.is_none_or(|known| rank(&sweep) < rank(known)) {
-                sample.sweeps.insert(row.mount.channel, sweep);
+                sample.sweeps.insert(channel, sweep);
             }
         }
         Ok(())

@@ -740,13 +740,48 @@ fn the_folder_of_the_tables_opens_as_well_and_versions_are_distinguished() {
         let path = entry.unwrap().path();
         fs::copy(&path, copy.join(path.file_name().unwrap())).unwrap();
     }
-    let names: Vec<String> = set
-        .open()
-        .scenarios
-        .into_iter()
-        .map(|scenario| scenario.name)
-        .collect();
-    assert_eq!(names, ["v1.0-mini/scene_5", "v1.0-test/scene_5"]);
+    let names = || {
+        let scenarios = set.open().scenarios.into_iter();
+        scenarios
+            .map(|scenario| scenario.name)
+            .collect::<Vec<String>>()
+    };
+    assert_eq!(names(), ["v1.0-mini/scene_5"]);
+    let first = "sweeps/LIDAR_TOP_id_1/scene_5_000000.pcd.bin";
+    assert_eq!(
+        set.problems(&set.open()),
+        [format!(
+            "{first}: first sweep of scene v1.0-mini/scene_5: scene v1.0-test/scene_5, too, is left out"
+        )]
+    );
+    // A scene with sweeps of its own is another one.
+    std::os::unix::fs::symlink("sweeps", set.dir.path().join("others")).unwrap();
+    let data = copy.join("sample_data.json");
+    let text = fs::read_to_string(&data).unwrap();
+    fs::write(data, text.replace("sweeps/", "others/")).unwrap();
+    assert_eq!(names(), ["v1.0-mini/scene_5", "v1.0-test/scene_5"]);
+}
+
+#[test]
+fn sweeps_of_one_name_in_folders_of_their_own_are_ticks_of_their_own() {
+    let set = v2x_sim();
+    let mut data = set.rows("sample_data");
+    for row in &mut data {
+        let Some(file) = row["filename"].as_str().map(str::to_owned) else {
+            continue;
+        };
+        let own = format!("{}/sweep.pcd.bin", file.trim_end_matches(".pcd.bin"));
+        set.write(&own, &fs::read(set.dir.path().join(&file)).unwrap());
+        row["filename"] = json!(own);
+    }
+    set.table("sample_data", json!(data));
+    let dataset = set.open();
+    assert_eq!(set.problems(&dataset), Vec::<String>::new());
+    let scenario = &dataset.scenarios[0];
+    let stems = scenario.ticks.iter().map(|tick| tick.stem.as_str());
+    assert_eq!(stems.collect::<Vec<&str>>(), ["sweep", "sweep_000001"]);
+    let files = [0, 1].map(|tick| scenario.points_path(0, tick, None).unwrap());
+    assert_ne!(files[0], files[1]);
 }
 
 const TABLES: [&str; 9] = [

@@ -40,7 +40,14 @@ const LEAST_OVERLAP: f32 = 0.2;
 const ALONGSIDE: f64 = 0.4;
 /// The same overlap for sweeps that are farther apart than the search reaches.
 const FAR_OVERLAP: f32 = 0.1;
-
+/// Motion after which traffic and the frame of a map differ, metres, and the ticks that are tried for it.
+const FAR_M: f64 = 6.0;
+const FAR_STEPS: [usize; 5] = [1, 2, 4, 8, 16];
+/// Ratio of the overlap at rest to that at the stated motion after it: a tunnel looks alike at both.
+const RESTING_RATIO: f32 = 2.0;
+/// Overlap at the stated motion of what does not rest: static structure among traffic has 0.65 and more, sweeps in the
+/// frame of a map have 0.37 at most.
+const EXPLAINED: f32 = 0.4;
 /// Overlap from which two sweeps are one: traffic is never all of the structure.
 const REPEATED: f32 = 0.98;
 
@@ -93,7 +100,7 @@ fn agent_problem(scenario: &Scenario, index: usize, agent: &CavId) -> Option<Pro
     let reason = format!(
         "agent {agent}: {} of {count} pairs of sweeps contradict the poses: from {from} to {to} the poses have {} \
          ({:.0} % of the structure overlap), the sweeps {} ({:.0} %): poses of other sweeps, other axes or other units, \
-         or a LiDAR that repeats a sweep",
+         sweeps in the frame of a map, or a LiDAR that repeats a sweep",
         wrong.len(),
         shown(&first.pair.stated.cast()),
         100.0 * first.overlap,
@@ -186,11 +193,39 @@ fn judge(scenario: &Scenario, agent: usize, pair: SweepPair) -> Option<Option<Co
     let is_elsewhere = moved_m < NEAR_M && overlap.max(best.overlap) < LEAST_OVERLAP;
     let is_wrong =
         is_repeated || (is_better && is_other && is_judged && !is_traffic) || is_elsewhere;
+    if !is_wrong && best_m < ALONGSIDE * moved_m {
+        return Some(at_rest(scenario, agent, pair.ticks[0], &first));
+    }
     Some(is_wrong.then_some(Contradiction {
         pair,
         overlap,
         best,
     }))
+}
+
+/// The contradiction that the structure of the sweep of a tick stays at rest however far the poses move: the sweeps are
+/// in the frame of a map.
+fn at_rest(
+    scenario: &Scenario,
+    agent: usize,
+    start: usize,
+    first: &Structure,
+) -> Option<Contradiction> {
+    let pair = FAR_STEPS.iter().find_map(|step| {
+        let pair = pair_of(scenario, agent, [start, start + step])?;
+        (pair.stated.translation.vector.norm() > FAR_M).then_some(pair)
+    })?;
+    let second = scenario.load_points(agent, pair.ticks[1], None).ok()?;
+    let (second, stated) = (Structure::of(&second.points)?, pair.stated.cast());
+    let overlap = first.overlap(&second, &stated);
+    let best = first.at_rest(&second);
+    let is_resting = best.overlap > CLEAR.max(RESTING_RATIO * overlap)
+        && first.overlap_of_rest(&second, &stated) < EXPLAINED;
+    is_resting.then_some(Contradiction {
+        pair,
+        overlap,
+        best,
+    })
 }
 
 #[cfg(test)]

@@ -26,11 +26,13 @@ const SAMPLES: usize = 500;
 const LEAST_CELLS: usize = 60;
 /// Tolerance of heights, metres.
 const HEIGHT_TOLERANCE_M: f32 = 0.5;
+/// Likelihood below which a point coincides with nothing: 0.6 m away.
+const APART: f32 = 0.1;
 /// Turns around no motion that are tried, degrees, and their step.
 const MOST_TURN_DEG: i16 = 9;
 const TURN_STEP: usize = 3;
 /// Steps of the refinement: metres, and degrees.
-const REFINEMENTS: [(f32, f32); 3] = [(0.25, 1.5), (0.12, 0.75), (0.06, 0.4)];
+const REFINEMENTS: [[f32; 2]; 3] = [[0.25, 1.5], [0.12, 0.75], [0.06, 0.4]];
 
 /// Structures above the ground around a sensor.
 pub(super) struct Structure {
@@ -106,43 +108,56 @@ impl Structure {
         points.map(|point| self.likelihood(point)).sum::<f32>() / other.samples.len() as f32
     }
 
+    /// The same for that part of the other sweep's structure that does not coincide without a motion.
+    pub(super) fn overlap_of_rest(&self, other: &Self, first_from_second: &Isometry3<f32>) -> f32 {
+        let rest = (other.samples.iter()).filter(|point| self.likelihood(**point) < APART);
+        let overlaps = rest.map(|point| self.likelihood(first_from_second * point));
+        let overlaps: Vec<f32> = overlaps.collect();
+        overlaps.iter().sum::<f32>() / overlaps.len().max(1) as f32
+    }
+
+    /// The overlap without a motion.
+    pub(super) fn at_rest(&self, other: &Self) -> Match {
+        let first_from_second = Isometry3::identity();
+        Match {
+            first_from_second,
+            overlap: self.overlap(other, &first_from_second),
+        }
+    }
+
     /// The motion in the plane, up to a distance from none, at which the sweeps overlap best.
     pub(super) fn best_overlap(&self, other: &Self, radius_m: f32) -> Match {
-        let mut best = Match {
-            first_from_second: Isometry3::identity(),
-            overlap: self.overlap(other, &Isometry3::identity()),
-        };
+        let mut best = self.at_rest(other);
         let steps = (0_u16..).map(|step| 2.0 * CELL_M * f32::from(step) - radius_m);
         let offsets: Vec<f32> = steps.take_while(|&offset| offset <= radius_m).collect();
+        let turns = (-MOST_TURN_DEG..=MOST_TURN_DEG).step_by(TURN_STEP);
+        let turns: Vec<f32> = turns.map(f32::from).collect();
         // Step: a coarse grid of planar motions.
-        for degrees in (-MOST_TURN_DEG..=MOST_TURN_DEG).step_by(TURN_STEP) {
-            for x in &offsets {
-                for y in &offsets {
-                    self.try_motion(other, planar(*x, *y, f32::from(degrees)), &mut best);
-                }
-            }
-        }
+        self.improve(other, &offsets, &turns, &mut best);
         // Step: the neighbourhood of the best one, with smaller and smaller steps.
-        for (step_m, step_deg) in REFINEMENTS {
-            let around = best.first_from_second;
-            for turn in [-step_deg, 0.0, step_deg] {
-                for x in [-step_m, 0.0, step_m] {
-                    for y in [-step_m, 0.0, step_m] {
-                        self.try_motion(other, around * planar(x, y, turn), &mut best);
-                    }
-                }
-            }
+        for steps in REFINEMENTS {
+            let [offsets, turns] = steps.map(|step| [-step, 0.0, step]);
+            self.improve(other, &offsets, &turns, &mut best);
         }
         best
     }
 
-    fn try_motion(&self, other: &Self, first_from_second: Isometry3<f32>, best: &mut Match) {
-        let overlap = self.overlap(other, &first_from_second);
-        if overlap > best.overlap {
-            *best = Match {
-                first_from_second,
-                overlap,
-            };
+    /// Tries planar motions around the best one: offsets along x and y, metres, and turns, degrees.
+    fn improve(&self, other: &Self, offsets_m: &[f32], turns_deg: &[f32], best: &mut Match) {
+        let around = best.first_from_second;
+        for turn in turns_deg {
+            for x in offsets_m {
+                for y in offsets_m {
+                    let first_from_second = around * planar(*x, *y, *turn);
+                    let overlap = self.overlap(other, &first_from_second);
+                    if overlap > best.overlap {
+                        *best = Match {
+                            first_from_second,
+                            overlap,
+                        };
+                    }
+                }
+            }
         }
     }
 }

@@ -152,6 +152,33 @@ fn a_lidar_that_repeats_its_sweep_is_no_traffic() {
 }
 
 #[test]
+fn sweeps_in_the_frame_of_a_map_are_no_traffic() {
+    let poses: Vec<Isometry3<f64>> = (0..FRAMES)
+        .map(|frame| Isometry3::translation(frame as f64, 0.0, 1.8))
+        .collect();
+    assert_eq!(problems(&poses, &poses), Vec::<String>::new());
+    let dir = tempfile::tempdir().unwrap();
+    write(dir.path(), &poses, &poses, 0);
+    let world = street();
+    for (frame, pose) in poses.iter().enumerate() {
+        // What is within range, in the world already. Every sweep misses some of the posts.
+        let seen = world.iter().enumerate().filter(|(index, point)| {
+            (index / 12 + frame) % 5 > 0 && (point.coords - pose.translation.vector).norm() < 30.0
+        });
+        let bytes: Vec<u8> = seen
+            .flat_map(|(_, point)| [point.x, point.y, point.z, 0.5])
+            .flat_map(|value| (value as f32).to_le_bytes())
+            .collect();
+        fs::write(dir.path().join(format!("clouds/{frame}.bin")), bytes).unwrap();
+    }
+    let scenario = &crate::open(dir.path()).unwrap().scenarios[0];
+    let found = pose_problems(scenario);
+    assert_eq!(found.len(), 1, "{found:?}");
+    let part = "sweeps in the frame of a map";
+    assert!(found[0].message.contains(part), "{found:?}");
+}
+
+#[test]
 fn independent_frames_have_no_poses_to_contradict() {
     let poses = drive();
     let dir = tempfile::tempdir().unwrap();

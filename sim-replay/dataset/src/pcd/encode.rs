@@ -1,6 +1,6 @@
 //! Writing PCD files.
 
-use std::fmt::Write;
+use std::io::Write;
 
 use protocol::PointCloud;
 
@@ -52,24 +52,19 @@ pub fn encode(cloud: &PointCloud, encoding: Encoding, intensity: IntensityField<
             let packed = red_byte(fourth) << 16 | u32::from(green) << 8;
             [x, y, z, f32::from_bits(packed)]
         });
+    let mut bytes = header.into_bytes();
+    bytes.reserve_exact(points * bytes_per_point);
     match encoding {
         Encoding::Ascii => {
-            let mut text = header;
-            text.reserve(points * bytes_per_point);
             // With exponents: colours are subnormal numbers, whose plain decimals have over 40 digits.
             for [x, y, z, fourth] in stored {
-                // Writing to a String does not fail.
-                let _ = writeln!(text, "{x:e} {y:e} {z:e} {fourth:e}");
+                // Writing to a Vec does not fail.
+                let _ = writeln!(bytes, "{x:e} {y:e} {z:e} {fourth:e}");
             }
-            text.into_bytes()
         }
-        Encoding::Binary => {
-            let mut bytes = header.into_bytes();
-            bytes.reserve_exact(points * bytes_per_point);
-            bytes.extend(stored.flatten().flat_map(f32::to_le_bytes));
-            bytes
-        }
+        Encoding::Binary => bytes.extend(stored.flatten().flat_map(f32::to_le_bytes)),
     }
+    bytes
 }
 
 #[expect(

@@ -32,17 +32,6 @@ pub(super) enum Data {
     BinaryCompressed,
 }
 
-impl Data {
-    /// Name of the storage.
-    pub(super) fn name(self) -> &'static str {
-        match self {
-            Self::Ascii => "PCD, ascii",
-            Self::Binary => "PCD, binary",
-            Self::BinaryCompressed => "PCD, compressed",
-        }
-    }
-}
-
 /// One field of a point.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct PcdField {

@@ -122,17 +122,17 @@ pub fn decode(bytes: &[u8]) -> Result<PcdCloud, PcdError> {
 /// [`decode`] with the red byte of a colour as stored: 0 to 255.
 pub(crate) fn decode_stored(bytes: &[u8]) -> Result<PcdCloud, PcdError> {
     let (header, body) = PcdHeader::parse(bytes)?;
-    let cloud = match header.data {
-        Data::Ascii => ascii::decode(&header, body),
-        Data::Binary => binary::decode(&header, body),
-        Data::BinaryCompressed => binary::decode_compressed(&header, body),
-    }?;
+    let (cloud, form) = match header.data {
+        Data::Ascii => (ascii::decode(&header, body)?, "PCD, ascii"),
+        Data::Binary => (binary::decode(&header, body)?, "PCD, binary"),
+        Data::BinaryCompressed => (binary::decode_compressed(&header, body)?, "PCD, compressed"),
+    };
     let intensity = header
         .intensity_origin()
         .map(|(field, kind)| IntensityOrigin::stored(field, kind));
     Ok(PcdCloud {
         intensity,
-        form: header.data.name(),
+        form,
         ..cloud
     })
 }

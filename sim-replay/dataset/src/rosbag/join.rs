@@ -17,22 +17,11 @@ use crate::{ReadError, Result};
 /// Numbers of messages of two topics of clouds count as equal up to this share: a recorder begins between them.
 const SAME_COUNT: f64 = 0.95;
 
-/// The sweeps of a bag with their poses.
-#[derive(Debug)]
-pub(super) struct Joined {
-    /// By the stamps of their headers.
-    pub(super) sweeps: BTreeMap<u64, JoinedSweep>,
-    /// Topics that were chosen, and those that were not.
-    pub(super) text: String,
-}
+/// The sweeps of a bag by the stamps of their headers; topics that were chosen, and those that were not.
+type Joined = (BTreeMap<u64, JoinedSweep>, String);
 
-/// A sweep.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct JoinedSweep {
-    pub(super) place: MessagePlace,
-    /// `None` in a bag without poses.
-    pub(super) world_from_lidar: Option<Pose>,
-}
+/// Place and pose (`world_from_lidar`) of a sweep; no pose in a bag without poses.
+pub(super) type JoinedSweep = (MessagePlace, Option<Pose>);
 
 /// Sweeps of a topic, and the poses that a source gives them.
 struct JoinAttempt {
@@ -139,15 +128,8 @@ impl JoinAttempt {
         };
         let joined = sweeps.sweeps.iter().zip(poses);
         let joined = joined.filter(|(_, pose)| pose.is_some() || chosen.is_none());
-        let joined = joined.map(|(sweep, world_from_lidar)| {
-            let joined = JoinedSweep {
-                place: sweep.place,
-                world_from_lidar,
-            };
-            (sweep.nanos, joined)
-        });
-        let sweeps = joined.collect();
-        Joined { sweeps, text }
+        let joined = joined.map(|(sweep, pose)| (sweep.nanos, (sweep.place, pose)));
+        (joined.collect(), text)
     }
 }
 

@@ -71,19 +71,19 @@ fn open(path: &Path, options: &OpenOptions, problems: &mut Vec<ReadError>) -> Re
     let mut contents = BagContents::of(path);
     let storage = Storage::open(&files, &mut contents, problems)?;
     contents.finish(problems);
-    let joined = join(path, &contents, problems)?;
-    let stamps = joined.sweeps.keys();
+    let (sweeps, text) = join(path, &contents, problems)?;
+    let stamps = sweeps.keys();
     let ticks = stamps.map(|nanos| Tick::new(nanos.to_string(), *nanos));
     let ticks = ticks.collect();
     let source = Bag {
         storage,
         description: files::description(path),
-        sweeps: joined.sweeps,
+        sweeps,
         scale: options.intensity_scale,
         divisor: OnceLock::new(),
     };
     Ok(Scenario {
-        joins: vec![joined.text],
+        joins: vec![text],
         ..single_vehicle(Layout::ROSBAG, ticks, Arc::new(source))
     })
 }
@@ -96,11 +96,11 @@ impl Bag {
     }
 
     /// The sweep of a stamp with the intensities as stored.
-    fn read_stored(&self, nanos: u64, sweep: &JoinedSweep) -> Result<PcdCloud> {
-        let bytes = self.storage.read(sweep.place)?;
+    fn read_stored(&self, nanos: u64, &(place, _): &JoinedSweep) -> Result<PcdCloud> {
+        let bytes = self.storage.read(place)?;
         let read = read_point_cloud(&bytes, &LIMITS).map_err(|error| {
             let reason = format!("sweep {nanos}: {error}");
-            ReadError::malformed(self.storage.path(sweep.place), reason)
+            ReadError::malformed(self.storage.path(place), reason)
         })?;
         Ok(PcdCloud {
             points: read.points,
@@ -117,7 +117,7 @@ impl Bag {
 impl FrameSource for Bag {
     fn frame(&self, agent: &CavId, tick: &Tick) -> Result<Frame> {
         let mut frame = Frame::empty(agent.clone(), tick.capture_nanos, Handedness::Right);
-        frame.world_from_lidar = self.sweep(tick)?.world_from_lidar;
+        (_, frame.world_from_lidar) = *self.sweep(tick)?;
         Ok(frame)
     }
 
@@ -142,7 +142,7 @@ impl FrameSource for Bag {
 
     fn points_path(&self, _: &CavId, tick: &Tick, _: Option<&str>) -> PathBuf {
         self.sweep(tick)
-            .map(|sweep| self.storage.path(sweep.place).to_owned())
+            .map(|(place, _)| self.storage.path(*place).to_owned())
             .unwrap_or_default()
     }
 }

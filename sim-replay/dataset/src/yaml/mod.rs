@@ -20,8 +20,6 @@ pub(super) use field::YamlField;
 pub(super) use node::{Value, YamlNode};
 pub(super) use numbers::whole;
 
-use tree::Unsound;
-
 use super::{ReadError, Result, files};
 
 /// Largest YAML file that is read, bytes. Frames with four cameras and fifty objects have about 20 kB.
@@ -41,8 +39,7 @@ pub(super) fn parse(path: &Path, bytes: &[u8]) -> Result<YamlNode> {
         let breaks = valid.filter(|&&byte| byte == b'\n').count();
         malformed(breaks as u64 + 1, "the text is not UTF-8".into())
     })?;
-    tree::build(text)
-        .map_err(|Unsound { line, reason }| malformed(line, format!("no sound YAML: {reason}")))
+    tree::build(text).map_err(|(line, reason)| malformed(line, format!("no sound YAML: {reason}")))
 }
 
 #[cfg(test)]

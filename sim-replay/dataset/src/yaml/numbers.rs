@@ -58,7 +58,7 @@ impl YamlField<'_> {
                 }
             }
             _ if numpy_tags::is_python(self.node) => {
-                let NumpyArray { shape, values } = numpy_tags::array(self)?;
+                let (shape, values) = numpy_tags::array(self)?;
                 let is_row = shape.iter().filter(|&&size| size != 1).count() <= 1;
                 let found = values.as_slice().try_into().ok().filter(|_| is_row);
                 numbers = found.ok_or_else(|| {
@@ -82,15 +82,14 @@ impl YamlField<'_> {
         };
         let rows = self.items()?;
         let rows = rows.iter().map(Self::row).collect::<Result<Vec<_>>>()?;
-        let inner = rows.first().map_or_else(Vec::new, |row| row.shape.clone());
-        if rows.iter().any(|row| row.shape != inner) {
+        let inner = rows.first().map(|(shape, _)| shape.clone());
+        let inner = inner.unwrap_or_default();
+        if rows.iter().any(|(shape, _)| *shape != inner) {
             return Err(self.error("rows of different lengths"));
         }
         let shape = [vec![items.len()], inner].concat();
-        Ok(NumpyArray {
-            shape,
-            values: rows.into_iter().flat_map(|row| row.values).collect(),
-        })
+        let values = rows.into_iter().flat_map(|(_, values)| values);
+        Ok((shape, values.collect()))
     }
 
     /// An item of a list: a number, or a row of numbers.
@@ -99,12 +98,12 @@ impl YamlField<'_> {
             Value::List(items) if !numpy_tags::is_call(self.node) => {
                 let numbers = self.items()?;
                 let values = numbers.iter().map(Self::number).collect::<Result<_>>()?;
-                Ok(NumpyArray::new(vec![items.len()], values))
+                Ok((vec![items.len()], values))
             }
             Value::Map(_) | Value::List(_) if numpy_tags::is_python(self.node) => {
                 numpy_tags::array(self)
             }
-            _ => Ok(NumpyArray::new(vec![], vec![self.number()?])),
+            _ => Ok((vec![], vec![self.number()?])),
         }
     }
 }

@@ -17,13 +17,8 @@ const MAX_ALIASED_NODES: usize = 200_000;
 /// YAML's own prefix of tags, written `!!`.
 const TAG_PREFIX: &str = "tag:yaml.org,2002:";
 
-/// A fault of a document.
-#[derive(Debug)]
-pub(super) struct Unsound {
-    /// The line, from 1.
-    pub(super) line: u64,
-    pub(super) reason: String,
-}
+/// A fault of a document: the line, from 1, and the reason.
+type Unsound = (u64, String);
 
 /// Builds the tree of a text with at most one document.
 pub(super) fn build(text: &str) -> Result<YamlNode, Unsound> {
@@ -79,19 +74,13 @@ impl<'t> TreeBuilder<'t> {
                 self.line = span.start.line().max(1) as u64;
                 Ok(event)
             }
-            Some(Err(error)) => Err(Unsound {
-                line: error.marker().line().max(1) as u64,
-                reason: error.info(),
-            }),
+            Some(Err(error)) => Err((error.marker().line().max(1) as u64, error.info())),
             None => Ok(Event::StreamEnd),
         }
     }
 
     fn unsound(&self, reason: impl Into<String>) -> Unsound {
-        Unsound {
-            line: self.line,
-            reason: reason.into(),
-        }
+        (self.line, reason.into())
     }
 
     /// The node that begins with an event.
@@ -185,15 +174,11 @@ impl<'t> TreeBuilder<'t> {
     }
 
     fn alias(&mut self, anchor: usize, line: u64) -> Result<YamlNode, Unsound> {
-        let size = self.anchors.get(&anchor).map(|(_, size)| *size);
-        self.count_aliased(size.unwrap_or(0))?;
-        match self.anchors.get(&anchor) {
-            Some((node, _)) => Ok(YamlNode {
-                line,
-                ..node.clone()
-            }),
-            None => Err(self.unsound("an alias within its own anchor")),
-        }
+        let Some((node, size)) = self.anchors.get(&anchor).cloned() else {
+            return Err(self.unsound("an alias within its own anchor"));
+        };
+        self.count_aliased(size)?;
+        Ok(YamlNode { line, ..node })
     }
 
     fn count_aliased(&mut self, size: usize) -> Result<(), Unsound> {
@@ -210,10 +195,8 @@ impl<'t> TreeBuilder<'t> {
 /// Without YAML's own prefix.
 fn tag_text(tag: &Tag) -> Box<str> {
     let (handle, suffix) = tag.parts();
-    match handle.strip_prefix(TAG_PREFIX) {
-        Some(rest) => format!("{rest}{suffix}").into(),
-        None => format!("{handle}{suffix}").into(),
-    }
+    let handle = handle.strip_prefix(TAG_PREFIX).unwrap_or(handle);
+    format!("{handle}{suffix}").into()
 }
 
 fn size(node: &YamlNode) -> usize {

@@ -38,15 +38,10 @@ struct Generator {
     frames: usize,
     period_seconds: f64,
     weather: String,
-    #[serde(default = "default_layout")]
-    layout: String,
+    layout: Option<String>,
     /// Size of the images, which stands among the sensors.
     #[serde(skip)]
     cameras: String,
-}
-
-fn default_layout() -> String {
-    SceneLayout::Opv2v.name().to_owned()
 }
 
 /// True if scenes of these options are in their folder already. They may have further weather copies.
@@ -62,6 +57,8 @@ pub fn are_kept(options: &SynthOptions) -> Result<bool> {
     let scenarios = read(folder)?;
     let maps: Vec<String> = sources(options).iter().map(RoadMapSource::name).collect();
     for made in &scenarios {
+        let opv2v = SceneLayout::Opv2v.name();
+        let layout = made.layout.as_deref().unwrap_or(opv2v);
         let settings: [(&str, &dyn ToString, &dyn ToString); 8] = [
             ("subset", &made.subset, &options.subset.name()),
             ("seed", &made.seed, &options.seed),
@@ -69,7 +66,7 @@ pub fn are_kept(options: &SynthOptions) -> Result<bool> {
             ("period_seconds", &made.period_seconds, &options.period_s),
             ("weather", &made.weather, &options.weather.name()),
             ("map_seed", &made.map_seed, &options.map_seed),
-            ("layout", &made.layout, &options.layout.name()),
+            ("layout", &layout, &options.layout.name()),
             ("cameras", &made.cameras, &options.image_size()),
         ];
         for (setting, found, wanted) in settings {

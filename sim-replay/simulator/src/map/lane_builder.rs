@@ -1,8 +1,9 @@
 //! Lane builder: makes a lane graph from a road network.
 
 use super::conflicts;
+use super::finding::Finding;
 use super::lane::{Lane, LaneGraph, LaneId};
-use super::lane_links::{LaneOrigin, LinkCounts, Linker};
+use super::lane_links::{LaneOrigin, Linker};
 use super::road::{LaneKind, Road, RoadNetwork};
 
 /// Distance between the points taken from the curves before they are spread evenly, metres.
@@ -13,8 +14,8 @@ const STEP_M: f64 = 1.0;
 const DEFAULT_LIMIT_MPS: f64 = 13.9;
 
 /// Builds the driving lanes of `network` and their links. `Road::leads_along` gives the direction of each lane:
-/// traffic keeps right or left, road by road.
-pub fn lane_graph(network: &RoadNetwork) -> (LaneGraph, LinkCounts) {
+/// traffic keeps right or left, road by road. Returned with the links that do not meet, and those the map lacks.
+pub fn lane_graph(network: &RoadNetwork) -> (LaneGraph, Vec<Finding>) {
     let (mut lanes, mut origins) = (Vec::new(), Vec::new());
     for (road_index, road) in network.roads.iter().enumerate() {
         for (section_index, section) in road.sections.iter().enumerate() {
@@ -34,9 +35,9 @@ pub fn lane_graph(network: &RoadNetwork) -> (LaneGraph, LinkCounts) {
     let mut graph = LaneGraph::new(lanes);
     let linker = Linker { network, origins };
     linker.link_neighbours(&mut graph);
-    let counts = linker.link_successors(&mut graph);
+    let findings = linker.link_successors(&mut graph);
     conflicts::find(&mut graph);
-    (graph, counts)
+    (graph, findings)
 }
 
 fn build_lane(road: &Road, origin: LaneOrigin, id: LaneId) -> Option<Lane> {

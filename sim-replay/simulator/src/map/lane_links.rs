@@ -13,17 +13,6 @@ const LINK_TURN_RAD: f64 = 0.35;
 /// Narrower lanes are not linked unless the map does so, metres.
 const LEAST_WIDTH_M: f64 = 1.0;
 
-/// Result of linking the lanes of a map.
-#[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub struct LinkCounts {
-    /// Links made.
-    pub made: usize,
-    /// Links refused because the lanes do not meet in place and heading.
-    pub refused: usize,
-    /// The refused links by road, and links made where the map has none.
-    pub findings: Vec<Finding>,
-}
-
 /// Origin of a lane of the graph in the road network.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) struct LaneOrigin {
@@ -72,10 +61,10 @@ impl Linker<'_> {
         }
     }
 
-    /// Fills [`Lane::successors`] and [`Lane::predecessors`].
-    pub(super) fn link_successors(&self, graph: &mut LaneGraph) -> LinkCounts {
+    /// Fills [`Lane::successors`] and [`Lane::predecessors`]. Returns the links refused because the lanes do not meet in
+    /// place and heading, by road, and links made where the map has none.
+    pub(super) fn link_successors(&self, graph: &mut LaneGraph) -> Vec<Finding> {
         let roads = &self.network.roads;
-        let mut counts = LinkCounts::default();
         let mut log = FindingLog::default();
         for (index, &origin) in self.origins.iter().enumerate() {
             log.enter("road", &roads[origin.road].id);
@@ -86,10 +75,8 @@ impl Linker<'_> {
                 }
                 let joint = Joint::of(&graph.lanes[index], graph.lane(next));
                 if joint.meets() {
-                    counts.made += 1;
                     successors.push(next);
                 } else {
-                    counts.refused += 1;
                     let onto = self.origins[next.0 as usize];
                     let (beside_m, step_m, turn_rad) =
                         (joint.beside_m, joint.step_m, joint.turn_rad);
@@ -108,7 +95,6 @@ impl Linker<'_> {
                 let found =
                     format!("leads from lane {lane} to no lane, though lane {lane} continues");
                 log.add(0, "link", &found, "lanes of one id linked");
-                counts.made += 1;
                 successors.push(next);
             }
             for &next in &successors {
@@ -117,8 +103,7 @@ impl Linker<'_> {
             }
             graph.lanes[index].successors = successors;
         }
-        counts.findings = log.list;
-        counts
+        log.list
     }
 
     /// The lane of the same id in the road's next section, where neither is linked to any lane and both are one.

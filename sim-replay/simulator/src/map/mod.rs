@@ -111,7 +111,7 @@ pub fn build(source: &RoadMapSource, map_seed: u64) -> Result<MapModel, FileErro
         RoadMapSource::Town1 => layout::town1(map_seed),
         RoadMapSource::Town4 => layout::town4(map_seed),
         RoadMapSource::OpenDrive(path) => {
-            let Map { network, lanes } = read_map(path)?;
+            let (network, lanes) = read_map(path)?;
             check_extent(path, &network, &lanes)?;
             let islands = Vec::new();
             RoadLayout { network, islands }
@@ -139,25 +139,17 @@ fn check_extent(path: &Path, network: &RoadNetwork, graph: &LaneGraph) -> Result
     Ok(())
 }
 
-/// A map as read from its file.
-#[derive(Debug, Clone)]
-pub struct Map {
-    /// Its roads and junctions, with findings of parts that were not built as the file gives them.
-    pub network: RoadNetwork,
-    /// Its driving lanes.
-    pub lanes: LaneGraph,
-}
-
-/// Reads the file of an OpenDRIVE map.
+/// Reads the file of an OpenDRIVE map: its roads and junctions, with findings of parts that were not built as the file
+/// gives them, and its driving lanes.
 ///
 /// # Errors
 /// [`FileError`] if it is not readable, or no usable OpenDRIVE map.
-pub fn read_map(path: &Path) -> Result<Map, FileError> {
+pub fn read_map(path: &Path) -> Result<(RoadNetwork, LaneGraph), FileError> {
     let bytes = bounded_file::read(path, opendrive::MAX_BYTES as u64).at(path)?;
     let mut network = opendrive::read(&bytes).at(path)?;
-    let (lanes, counts) = lane_builder::lane_graph(&network);
-    network.findings.extend(counts.findings);
-    Ok(Map { network, lanes })
+    let (lanes, findings) = lane_builder::lane_graph(&network);
+    network.findings.extend(findings);
+    Ok((network, lanes))
 }
 
 fn place_roadside(name: String, layout: &RoadLayout, map_seed: u64) -> MapModel {

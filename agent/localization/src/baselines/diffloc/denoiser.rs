@@ -40,15 +40,6 @@ pub struct PoseDenoiser {
     step_frequencies: Tensor,
 }
 
-/// Attention between the sweeps of a window.
-#[derive(Debug, Clone, Copy)]
-pub enum Windows<'a> {
-    /// Each sweep is alone.
-    Single,
-    /// `[W]` of 0 or 1: whether the sweeps of a window see each other.
-    Joint(&'a Tensor),
-}
-
 impl PoseDenoiser {
     /// Builds the layers below `path`.
     ///
@@ -77,7 +68,8 @@ impl PoseDenoiser {
     }
 
     /// Velocity `[W, F, POSE]` of noisy `poses` of the same shape at steps `[W]`, from the features `[W, F, C]` of
-    /// their sweeps, oldest first; single precision throughout.
+    /// their sweeps, oldest first; single precision throughout. `joint` is `[W]` of 0 or 1: whether the sweeps of a
+    /// window see each other; `None`: each sweep is alone.
     ///
     /// # Errors
     /// Those of the tensor library.
@@ -86,7 +78,7 @@ impl PoseDenoiser {
         poses: &Tensor,
         steps: &Tensor,
         features: &Tensor,
-        windows: Windows<'_>,
+        joint: Option<&Tensor>,
     ) -> tch::Result<Tensor> {
         let (count, frames, _) = poses.size3()?;
         let on = (Kind::Float, poses.device());
@@ -95,9 +87,9 @@ impl PoseDenoiser {
         let single = single
             .f_mul_scalar(UNSEEN)?
             .f_view([1, 1, frames, frames])?;
-        let (mask, age) = match windows {
-            Windows::Single => (single, Tensor::f_ones([1, 1, 1], on)?),
-            Windows::Joint(joint) => {
+        let (mask, age) = match joint {
+            None => (single, Tensor::f_ones([1, 1, 1], on)?),
+            Some(joint) => {
                 let alone = joint.f_neg()?.f_add_scalar(1.0)?;
                 // The newest sweep is marked by 1, as one that is alone.
                 let place = Tensor::f_linspace(0.0, 1.0, frames, on)?.f_view([1, -1, 1])?;

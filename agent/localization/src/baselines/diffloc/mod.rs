@@ -17,6 +17,6 @@ mod network;
 mod noise_schedule;
 mod transformer;
 
-pub use denoiser::{PoseDenoiser, Windows};
+pub use denoiser::PoseDenoiser;
 pub use network::{DescribedTokens, DiffLoc, DiffLocLocalizer};
 pub use noise_schedule::NoiseSchedule;

@@ -8,7 +8,7 @@ use rand_distr::{Distribution, StandardNormal};
 use tch::nn::{self, Init};
 use tch::{Kind, Tensor, no_grad};
 
-use super::denoiser::{FEATURES, PoseDenoiser, Windows};
+use super::denoiser::{FEATURES, PoseDenoiser};
 use super::noise_schedule::NoiseSchedule;
 use super::transformer::{NORM_EPS, TransformerLayer};
 use crate::baselines::layers::TokenNorm;
@@ -98,11 +98,11 @@ impl DiffLoc {
     }
 
     /// Poses `[W, F, 5]` relative to their classes of sweeps with features [of their classes](Self::of_class)
-    /// `[W, F, FEATURES]`, oldest first; without gradients. The same features give the same poses.
+    /// `[W, F, FEATURES]`, each sweep alone; without gradients. The same features give the same poses.
     ///
     /// # Errors
     /// Those of the tensor library.
-    pub fn denoised(&self, features: &Tensor, windows: Windows<'_>) -> tch::Result<Tensor> {
+    pub fn denoised(&self, features: &Tensor) -> tch::Result<Tensor> {
         let (count, frames, _) = features.size3()?;
         let device = features.device();
         let mut random = ChaCha8Rng::seed_from_u64(START_SEED);
@@ -113,7 +113,7 @@ impl DiffLoc {
             self.schedule
                 .denoise(&start, DENOISING_STEPS, |noisy, step| {
                     let steps = Tensor::f_full([count], step, (Kind::Int64, device))?;
-                    self.denoiser.forward(noisy, &steps, features, windows)
+                    self.denoiser.forward(noisy, &steps, features, None)
                 })
         })
     }
@@ -150,7 +150,7 @@ impl RegressPose for DiffLoc {
         let described = self.describe(tokens, kind, false)?;
         let classes = described.places.f_argmax(1, false)?;
         let features = self.of_class(&described.features, &classes)?;
-        let found = self.denoised(&features.f_unsqueeze(1)?, Windows::Single)?;
+        let found = self.denoised(&features.f_unsqueeze(1)?)?;
         places.absolute(&found.f_squeeze_dim(1)?, &classes)
     }
 }

@@ -63,7 +63,7 @@ pub struct ConfidenceModel {
     pub weights: [f64; FEATURES],
     /// Decreasing function from the expected logarithm of the error to sigma.
     pub sigma: MonotoneMap,
-    /// Threshold: poses of a lower sigma are rejected.
+    /// Threshold: poses of a lower sigma are rejected. Files and errors have its earlier name.
     #[serde(rename = "withhold_below")]
     pub reject_below: f64,
 }
@@ -78,7 +78,7 @@ impl ConfidenceModel {
         for &weight in &self.weights {
             within("a weight", weight, 0.0, MAX_WEIGHT)?;
         }
-        within("reject_below", self.reject_below, 0.0, 1.0)?;
+        within("withhold_below", self.reject_below, 0.0, 1.0)?;
         self.sigma.check()
     }
 
@@ -210,7 +210,7 @@ mod tests {
                 reject_below: 1.5,
                 ..example()
             },
-            "reject_below is 1.5"
+            "withhold_below is 1.5"
         ));
         for knots in [
             vec![(1.0, 0.5), (0.0, 0.4)],

@@ -221,20 +221,15 @@ pub enum NoIcpFit {
         /// Number found.
         found: usize,
     },
-    /// The clouds do not overlap at the resulting pose.
-    #[error("{overlap:.2} of the points have a partner, at least {MIN_OVERLAP:.2} must")]
-    TooLittleOverlap {
-        /// Share of points with a partner.
-        overlap: f64,
-    },
-    /// Some direction is unconstrained: nothing but ground, or a street between two walls.
+    /// The clouds do not overlap at the resulting pose: share of points with a partner.
+    #[error("{0:.2} of the points have a partner, at least {MIN_OVERLAP:.2} must")]
+    TooLittleOverlap(f64),
+    /// Some direction is unconstrained: nothing but ground, or a street between two walls. Constraint of the worst
+    /// direction, 0..1.
     #[error(
-        "the planes constrain the worst direction to {constraint:.1e} only, at least {MIN_CONSTRAINT:.1e} is needed"
+        "the planes constrain the worst direction to {0:.1e} only, at least {MIN_CONSTRAINT:.1e} is needed"
     )]
-    Unconstrained {
-        /// Constraint of the worst direction, 0..1.
-        constraint: f64,
-    },
+    Unconstrained(f64),
 }
 
 /// Fewest source points and target planes.
@@ -382,12 +377,12 @@ impl NormalEquations {
     fn judge(&self, points: usize) -> Result<(), NoIcpFit> {
         let overlap = self.pairs / points as f64;
         if overlap < MIN_OVERLAP {
-            return Err(NoIcpFit::TooLittleOverlap { overlap });
+            return Err(NoIcpFit::TooLittleOverlap(overlap));
         }
         let eigen = SymmetricEigen::new(self.hessian / self.weight);
         let constraint = eigen.eigenvalues.min();
         if constraint < MIN_CONSTRAINT {
-            return Err(NoIcpFit::Unconstrained { constraint });
+            return Err(NoIcpFit::Unconstrained(constraint));
         }
         Ok(())
     }
@@ -564,7 +559,7 @@ mod tests {
                 &config,
             );
             assert!(
-                matches!(found, Err(NoIcpFit::Unconstrained { .. })),
+                matches!(found, Err(NoIcpFit::Unconstrained(_))),
                 "{found:?}"
             );
         }
@@ -599,7 +594,7 @@ mod tests {
         let elsewhere = Isometry3::translation(500.0, 0.0, 0.0);
         assert!(matches!(
             register(&source, &target, &elsewhere, &config),
-            Err(NoIcpFit::TooLittleOverlap { .. })
+            Err(NoIcpFit::TooLittleOverlap(_))
         ));
     }
 }

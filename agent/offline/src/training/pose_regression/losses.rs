@@ -1,7 +1,7 @@
 //! Losses of the networks that regress poses from tokens.
 
 use localization::baselines::RegressPose;
-use localization::baselines::diffloc::{DiffLoc, Windows};
+use localization::baselines::diffloc::DiffLoc;
 use localization::baselines::hypliloc::HypLiLoc;
 use localization::baselines::place_classes::PlaceClasses;
 use tch::{Kind, Reduction, Result, Tensor};
@@ -24,29 +24,20 @@ const MASK_WEIGHT: f64 = 0.03;
 /// Share of a training after which HypLiLoc learns the weights of position and heading.
 const WEIGHTS_LEARNT_FROM: f64 = 1.0 / 3.0;
 
-/// Result of a batch.
-pub(super) struct Losses {
-    /// Weighted sum, with gradient.
-    pub(super) total: Tensor,
-    /// Mean L1 of the poses, without gradient.
-    pub(super) pose: Tensor,
-    /// Cross entropy of places, without gradient.
-    pub(super) place: Tensor,
-}
-
 /// A network that can be trained.
 pub(super) trait PoseLoss: RegressPose {
     /// Sweeps of a window.
     const FRAMES: i64;
 
-    /// Losses of windows, one after another, when a share of the training is done.
+    /// Losses of windows, one after another, when a share of the training is done: the weighted sum, with gradient; and
+    /// without it the mean L1 of the poses and the cross entropy of places.
     fn losses(
         &self,
         batch: &TokenSweeps,
         places: &PlaceClasses,
         kind: Kind,
         share_done: f64,
-    ) -> Result<Losses>;
+    ) -> Result<(Tensor, [Tensor; 2])>;
 }
 
 /// The true classes of poses, and those near which the network shall state them, with the poses relative to these.
@@ -74,7 +65,7 @@ impl PoseLoss for DiffLoc {
         places: &PlaceClasses,
         kind: Kind,
         _share_done: f64,
-    ) -> Result<Losses> {
+    ) -> Result<(Tensor, [Tensor; 2])> {
         let described = self.describe(&batch.tokens, kind, true)?;
         let (logits, statics) = (&described.static_logits, &batch.statics);
         let mean = Reduction::Mean;
@@ -87,11 +78,8 @@ impl PoseLoss for DiffLoc {
         let features = features.f_view([-1, Self::FRAMES, width])?;
         let poses = relative.f_view([-1, Self::FRAMES, 5])?;
         let [pose, differences] = denoising_losses(self, &features, &poses)?;
-        Ok(Losses {
-            total: &pose + differences + mask * MASK_WEIGHT + &place * PLACE_WEIGHT,
-            pose: pose.f_detach()?,
-            place: place.f_detach()?,
-        })
+        let total = &pose + differences + mask * MASK_WEIGHT + &place * PLACE_WEIGHT;
+        Ok((total, [pose.f_detach()?, place.f_detach()?]))
     }
 }
 
@@ -109,8 +97,8 @@ fn denoising_losses(network: &DiffLoc, features: &Tensor, poses: &Tensor) -> Res
     let joint = Tensor::f_rand([count], on)?.f_ge(SINGLE)?;
     let joint = joint.f_to_kind(Kind::Float)?;
     let noisy = schedule.add_noise(&poses, &noise, &steps)?;
-    let (denoiser, windows) = (&network.denoiser, Windows::Joint(&joint));
-    let velocity = denoiser.forward(&noisy, &steps, &features, windows)?;
+    let denoiser = &network.denoiser;
+    let velocity = denoiser.forward(&noisy, &steps, &features, Some(&joint))?;
     let error = schedule.poses(&noisy, &velocity, &steps)?.f_sub(&poses)?;
     // The difference of two errors is the error of the difference.
     let differences = error.f_diff::<Tensor>(1, 1, None, None)?.f_abs()?;
@@ -130,7 +118,7 @@ impl PoseLoss for HypLiLoc {
         places: &PlaceClasses,
         kind: Kind,
         share_done: f64,
-    ) -> Result<Losses> {
+    ) -> Result<(Tensor, [Tensor; 2])> {
         let features = self.features(&batch.tokens, kind, true)?;
         let [truth, near, relative] = classes(&batch.poses, places)?;
         let (mut errors, mut entropies) = (Vec::new(), Vec::new());
@@ -148,11 +136,9 @@ impl PoseLoss for HypLiLoc {
         };
         // Error * exp(-s) + s, where s is the learnt logarithm of the variance.
         let weighted = &errors * (-&log_variances).f_exp()? + log_variances;
-        Ok(Losses {
-            total: weighted.f_sum(Kind::Float)? + &place * PLACE_WEIGHT,
-            // The third branch, the fusion, gives the result.
-            pose: errors.f_detach()?.f_get(2)?.f_mean(Kind::Float)?,
-            place: place.f_detach()? / 3.0,
-        })
+        let total = weighted.f_sum(Kind::Float)? + &place * PLACE_WEIGHT;
+        // The third branch, the fusion, gives the result.
+        let pose = errors.f_detach()?.f_get(2)?.f_mean(Kind::Float)?;
+        Ok((total, [pose, place.f_detach()? / 3.0]))
     }
 }

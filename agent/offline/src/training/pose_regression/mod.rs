@@ -197,11 +197,11 @@ impl<N: PoseLoss> Task for PoseTraining<'_, N> {
         let batch = batch.augmented(N::FRAMES, self.sectors)?;
         let (network, places) = (&self.network.network, &self.network.places);
         let share_done = self.share_done(trainer);
-        let losses = network.losses(&batch, places, run.precision.kind(), share_done)?;
-        self.means
-            .push(Tensor::f_stack(&[losses.pose, losses.place], 0)?);
+        let kind = run.precision.kind();
+        let (total, of_parts) = network.losses(&batch, places, kind, share_done)?;
+        self.means.push(Tensor::f_stack(&of_parts, 0)?);
         self.latest = Some(batch);
-        Ok(losses.total)
+        Ok(total)
     }
 
     fn is_report_due(&self, trainer: &Trainer) -> bool {

@@ -53,13 +53,8 @@ pub(super) struct TokenCache {
     first_of_drive: Tensor,
 }
 
-/// A sweep before the encoder.
-struct Prepared {
-    voxels: SweepVoxels,
-    statics: [f32; TOKENS as usize],
-    world_from_sensor: Isometry3<f64>,
-    drive: usize,
-}
+/// A sweep before the encoder: voxels, static tokens, drive, and pose of the sensor.
+type ReadSweep = (SweepVoxels, [f32; TOKENS as usize], usize, Isometry3<f64>);
 
 impl PooledSweeps {
     /// Encodes every sweep of `list` that has a pose; `observe` gets the number of sweeps done and of all.
@@ -77,28 +72,27 @@ impl PooledSweeps {
         let mut loader = Prefetch::start(run.loader_threads, 0, move |batch| {
             // The threads also ask for batches beyond the end: their range is empty.
             let numbers = batch * BATCH..((batch + 1) * BATCH).min(total as u64);
-            let read = numbers.filter_map(|index| Prepared::read(&source, index as usize, &config));
+            let read = numbers.filter_map(|index| prepared(&source, index as usize, &config));
             read.collect::<Vec<_>>()
         });
         let mut parts = Vec::new();
         let (mut statics, mut drives, mut poses) = (Vec::new(), Vec::new(), Vec::new());
         for done in (0..total).step_by(BATCH as usize) {
             let sweeps = loader.next_batch()?;
-            let voxels: Vec<&SweepVoxels> = sweeps.iter().map(|sweep| &sweep.voxels).collect();
+            let voxels: Vec<&SweepVoxels> = sweeps.iter().map(|(voxels, ..)| voxels).collect();
             let batch = VoxelBatch::new(&voxels, encoder.config(), run.device)?;
             if !sweeps.is_empty() {
                 let cells = encoder.encode(&batch, run.precision.kind())?.cells;
-                for (number, sweep) in sweeps.iter().enumerate() {
-                    let rows = &batch.cell_rows[number];
+                for (voxels, rows) in voxels.iter().zip(&batch.cell_rows) {
                     let own = cells.f_narrow(0, rows.start, rows.end - rows.start)?;
                     // Half precision: the pooled features of all sweeps lie on the device at once.
-                    parts.push(pool(sweep.voxels.cells(), &own)?.f_to_kind(Kind::Half)?);
+                    parts.push(pool(voxels.cells(), &own)?.f_to_kind(Kind::Half)?);
                 }
             }
-            for sweep in sweeps {
-                statics.push(sweep.statics);
-                drives.push(sweep.drive);
-                poses.push(sweep.world_from_sensor);
+            for (_, is_static, drive, world_from_sensor) in sweeps {
+                statics.push(is_static);
+                drives.push(drive);
+                poses.push(world_from_sensor);
             }
             let done = (done + BATCH as usize).min(total);
             observe(&TrainingEvent::Encoding(done, total));
@@ -155,18 +149,12 @@ impl PooledSweeps {
     }
 }
 
-impl Prepared {
-    fn read(list: &SweepList, index: usize, config: &SceneEncoderConfig) -> Option<Self> {
-        let (frame, world_from_sensor) = list.posed_frame(index)?;
-        let points = frame.points.xyzi.iter().map(|&[x, y, z, _]| [x, y, z]);
-        let voxels = SweepVoxels::new(points, config);
-        Some(Self {
-            statics: static_tokens(voxels.cells(), &frame.objects, &world_from_sensor),
-            voxels,
-            world_from_sensor,
-            drive: list.drive(index)?,
-        })
-    }
+fn prepared(list: &SweepList, index: usize, config: &SceneEncoderConfig) -> Option<ReadSweep> {
+    let (frame, world_from_sensor) = list.posed_frame(index)?;
+    let points = frame.points.xyzi.iter().map(|&[x, y, z, _]| [x, y, z]);
+    let voxels = SweepVoxels::new(points, config);
+    let statics = static_tokens(voxels.cells(), &frame.objects, &world_from_sensor);
+    Some((voxels, statics, list.drive(index)?, world_from_sensor))
 }
 
 /// 1 for each token of which at most half of the cells that stand out lie in annotated boxes, else 0.

@@ -116,7 +116,7 @@ impl<'a> SceneTraining<'a> {
         let (encoder, sha256) = CellEncoder::load(&config.encoder, run.device)?;
         let mut cache = FeatureCache::build(training, &encoder, config.augmentation, run, observe)?;
         let unchanged = SweepAugmentation::NONE;
-        let validation = validation
+        let mut validation = validation
             .map(|list| FeatureCache::build(list, &encoder, unchanged, run, observe))
             .transpose()?;
         let format = encoder.format().clone();
@@ -130,7 +130,9 @@ impl<'a> SceneTraining<'a> {
         let stored_config = stored.as_ref().map(|(_, config)| config);
         let head_config = head_config(config, stored_config, &cache, &format, sha256)?;
         // Coordinates are relative to the origin of the head: f32 is exact enough near it only.
-        cache.move_origin(head_config.origin_m)?;
+        for cache in validation.iter_mut().chain([&mut cache]) {
+            cache.move_origin(head_config.origin_m)?;
+        }
         let variables = VarStore::new(run.device);
         let mut head = SceneHead::new(&variables.root(), &head_config)?;
         let class_of_sweep = match &stored {

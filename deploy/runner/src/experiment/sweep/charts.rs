@@ -9,13 +9,8 @@ use super::Run;
 use super::grid::Point;
 use crate::experiment::spec::Experiment;
 
-/// One figure.
-#[derive(Debug, Clone, PartialEq)]
-pub(super) struct Figure {
-    /// Name of its files.
-    pub(super) name: &'static str,
-    pub(super) charts: Vec<Chart>,
-}
+/// Name of the files of a figure, and its charts.
+type Figure = (&'static str, Vec<Chart>);
 
 /// A quantity that each point has.
 struct Dimension {
@@ -128,12 +123,9 @@ pub(super) fn figures(experiment: &Experiment, runs: &[Run]) -> Vec<Figure> {
                 series,
             })
         });
-        Figure {
-            name: dimension.name,
-            charts: charts.into_iter().flatten().collect(),
-        }
+        (dimension.name, Vec::from_iter(charts.into_iter().flatten()))
     });
-    figures.filter(|figure| !figure.charts.is_empty()).collect()
+    figures.filter(|(_, charts)| !charts.is_empty()).collect()
 }
 
 /// The axis of a chart's field; `None` without values.
@@ -224,7 +216,7 @@ mod tests {
         let figures = figures(&experiment, &runs);
         assert_eq!(figures.len(), 1);
         assert_eq!(
-            (figures[0].name, figures[0].charts[0].series[0].points.len()),
+            (figures[0].0, figures[0].1[0].series[0].points.len()),
             (BYTES, 3)
         );
         assert!(names().any(|name| name == BYTES));
@@ -238,7 +230,7 @@ mod tests {
             });
             let noises = noises.join(", ");
             let (experiment, runs) = runs(&format!("{{method: [max], pose_noise: [{noises}]}}"));
-            figures(&experiment, &runs).remove(0).charts.remove(0)
+            figures(&experiment, &runs).remove(0).1.remove(0)
         };
         let apart = chart_of([[1.0, 0.0], [1.0, 10.0], [2.0, 0.0], [2.0, 10.0]]);
         let lines: Vec<_> = apart
@@ -262,7 +254,7 @@ mod tests {
             run.cell.metrics.protocol = EvaluationProtocol::preset("v2v4real");
             run.cell.metrics.ap_frame_order.at_50 = Some(0.625);
         }
-        let chart = &figures(&experiment, &runs)[0].charts[0];
+        let chart = &figures(&experiment, &runs)[0].1[0];
         assert_eq!(chart.y.label, "AP, frame order");
         assert_eq!(chart.series[0].points, [(0.0, 0.625), (0.5, 0.625)]);
     }

@@ -5,7 +5,7 @@ use std::path::Path;
 use agent::rate::RateConfig;
 use anyhow::{Context, Result};
 use ego_fuser_offline::evaluation::AgentPool;
-use fusion::Method;
+use fusion::{Exchange, Method};
 use link::{CapacityConfig, LatencyModel, LinkConfig, LossModel};
 use localization::pose_source::{NoisyPoseConfig, PoseSourceConfig};
 use perception::model_config::DetectorConfig;
@@ -41,11 +41,13 @@ pub struct Point {
 
 /// Number of values of each axis.
 pub(in crate::experiment) fn sizes(grid: &Grid) -> Vec<(&'static str, usize)> {
-    let (methods, codecs) = (grid.method.len(), size(&grid.codec));
-    let mut sizes = match grid.reference.len() {
-        0 => vec![("method", methods), ("codec", codecs)],
-        // References come with the first encoding only, so they add up and do not multiply.
-        others => vec![("method with codec", methods * codecs + others)],
+    let (methods, codecs) = (grid.method.iter(), size(&grid.codec));
+    let encoded = methods.filter(|method| is_encoded(method)).count();
+    let others = grid.method.len() - encoded + grid.reference.len();
+    let mut sizes = match (codecs, others) {
+        (1, _) | (_, 0) => vec![("method", encoded + others), ("codec", codecs)],
+        // These come with the first encoding only, so they add up and do not multiply.
+        _ => vec![("method with codec", encoded * codecs + others)],
     };
     sizes.extend([
         ("latency_ms", size(&grid.latency_ms)),
@@ -57,6 +59,11 @@ pub(in crate::experiment) fn sizes(grid: &Grid) -> Vec<(&'static str, usize)> {
         ("seed", size(&grid.seed)),
     ]);
     sizes
+}
+
+/// True if a method exchanges feature maps: no other message depends on their encoding.
+fn is_encoded(method: &Method) -> bool {
+    method.exchange() == Exchange::Features
 }
 
 /// Number of values of an axis; 1 if it is absent.
@@ -82,8 +89,8 @@ pub fn points(experiment: &Experiment) -> Vec<Point> {
     let codecs = grid.codec.as_ref();
     let first = codecs.map(|codecs| codecs.iter().take(1).copied().collect());
     let mut points = Vec::new();
-    for (methods, codecs) in [(&grid.method, &grid.codec), (&grid.reference, &first)] {
-        let plain = methods.iter().map(|&method| Point {
+    for (place, &method) in grid.method.iter().chain(&grid.reference).enumerate() {
+        let plain = Point {
             method,
             codec,
             latency_ms: None,
@@ -93,9 +100,10 @@ pub fn points(experiment: &Experiment) -> Vec<Point> {
             pose_noise: None,
             vehicles: None,
             seed: 0,
-        });
-        let plain = plain.collect();
-        points.extend(spread(plain, codecs, |point| &mut point.codec));
+        };
+        let is_varied = place < grid.method.len() && is_encoded(&method);
+        let codecs = if is_varied { &grid.codec } else { &first };
+        points.extend(spread(vec![plain], codecs, |point| &mut point.codec));
     }
     let points = spread(points, &grid.latency_ms, |point| &mut point.latency_ms);
     let points = spread(points, &grid.jitter_ms, |point| &mut point.jitter_ms);
@@ -254,6 +262,18 @@ mod tests {
         assert_eq!((points.len(), count(&grid.grid)), (6, 6));
         assert!(points[4..].iter().all(|point| point.method == Method::LATE));
         assert!(points[4..].iter().all(|point| point.codec.keep.is_none()));
+    }
+
+    #[test]
+    fn methods_without_feature_maps_have_the_first_codec_alone() {
+        let codecs = "[{dtype: i8}, {dtype: i8, boxes: only}]";
+        let grid = format!("{{method: [late, max], codec: {codecs}, loss: [0, 0.5]}}");
+        let grid = experiment(&grid);
+        let points = points(&grid);
+        assert_eq!((points.len(), count(&grid.grid)), (6, 6));
+        let late = points.iter().filter(|point| point.method == Method::LATE);
+        let late: Vec<_> = late.map(|point| (point.codec.boxes, point.loss)).collect();
+        assert_eq!(late, [(None, Some(0.0)), (None, Some(0.5))]);
     }
 
     #[test]

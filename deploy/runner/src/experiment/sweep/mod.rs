@@ -11,7 +11,6 @@ mod table;
 mod varying;
 mod workers;
 
-use std::collections::BTreeSet;
 use std::fs;
 use std::io::{self, BufRead, Write};
 use std::ops::Range;
@@ -31,7 +30,7 @@ use support::file_error::FileError;
 use support::sampling::distinct;
 use support::{atomic_file, output};
 use terminal::progress;
-use training::feature_store::{FeatureStore, KeptMaps};
+use training::feature_store::FeatureStore;
 
 pub use grid::{Point, points};
 pub use table::csv;
@@ -47,15 +46,6 @@ pub(super) use generated_data::generate;
 
 /// Number of ticks that are timed before a sweep begins, for its estimate.
 const PROBED_TICKS: usize = 4;
-
-/// Result of a sweep.
-#[derive(Debug, Default)]
-pub struct SweepResult {
-    /// Columns that vary between the runs, as printed on a terminal.
-    pub table: String,
-    /// The runs, in the order of the grid.
-    pub runs: Vec<Run>,
-}
 
 /// A worker process of a sweep has ended, or reports why it cannot compute a run.
 #[derive(Debug, thiserror::Error)]
@@ -93,10 +83,7 @@ impl ExperimentSweep {
         let text = text.with_context(|| file.display().to_string())?;
         let experiment = read(file)?;
         generate(&experiment)?;
-        Ok(Self {
-            text,
-            ..Self::over(experiment, file, out)?
-        })
+        Self::over(experiment, text, file, out)
     }
 
     /// Prints the number of runs and the time that they will take, and writes nothing: a data set that does not exist
@@ -122,12 +109,12 @@ impl ExperimentSweep {
             ));
             return Ok(());
         }
-        let sweep = Self::over(experiment, file, out)?;
+        let sweep = Self::over(experiment, String::new(), file, out)?;
         let known = sweep.known(&sweep.keys()?)?;
         sweep.print_estimate(&known, &missing(&known, 0..known.len()), jobs)
     }
 
-    fn over(experiment: Experiment, file: &Path, out: &Path) -> Result<Self> {
+    fn over(experiment: Experiment, text: String, file: &Path, out: &Path) -> Result<Self> {
         let mut trial = experiment.trial().context("link")?;
         let data = OpenedData::open(&trial)?;
         if data.frame_count(experiment.scenarios) == 0 {
@@ -142,7 +129,7 @@ impl ExperimentSweep {
         }
         Ok(Self {
             file: file.to_owned(),
-            text: String::new(),
+            text,
             points: points(&experiment),
             experiment,
             data,
@@ -189,11 +176,12 @@ impl ExperimentSweep {
         self.compute_missing(&keys, slice.part(keys.len()), jobs)
     }
 
-    /// Computes the missing runs and writes table, charts and report.
+    /// Computes the missing runs and writes table, charts and report. Returns the columns that vary between the runs, as
+    /// printed on a terminal, and the runs, in the order of the grid.
     ///
     /// # Errors
     /// An error at the first run that cannot be computed; earlier runs are cached.
-    pub fn run(&self, jobs: usize, keep_maps: bool) -> Result<SweepResult> {
+    pub fn run(&self, jobs: usize, keep_maps: bool) -> Result<(String, Vec<Run>)> {
         let keys = self.keys()?;
         self.compute_missing(&keys, 0..keys.len(), jobs)?;
         // Read back from the cache, as other processes may have computed them.
@@ -206,7 +194,7 @@ impl ExperimentSweep {
         if !keep_maps {
             self.remove_maps()?;
         }
-        Ok(SweepResult { table, runs })
+        Ok((table, runs))
     }
 
     /// Computes the runs of `part` that are not cached.
@@ -231,6 +219,8 @@ impl ExperimentSweep {
             check::product(&self.experiment.grid),
             known.iter().flatten().count()
         ));
+        let lacking = (self.data).lacking(self.experiment.scenarios, self.experiment.frames);
+        lacking.into_iter().for_each(output::note);
         let Some(&first) = missing.first() else {
             return Ok(());
         };
@@ -266,15 +256,11 @@ impl ExperimentSweep {
         Ok(began.elapsed().as_secs_f64() / metrics.frames.max(1) as f64)
     }
 
-    fn kept_maps(&self) -> KeptMaps {
-        self.experiment.kept_maps(&self.maps())
-    }
-
     /// Computes the feature maps of all sweeps, once for each encoder that is needed.
     fn encode(&self, missing: &[usize], jobs: usize) -> Result<()> {
         for weights in self.encoders(missing)? {
             let bar = progress::bar(0, "sweeps encoded");
-            let kept = self.kept_maps();
+            let kept = self.experiment.kept_maps(&self.maps());
             let (scenarios, digests) = (&self.data.scenarios, &self.data.digests);
             let on_sweep = &mut |done, all| {
                 bar.set_length(all as u64);
@@ -289,15 +275,13 @@ impl ExperimentSweep {
     /// Removes the feature maps of the experiment, which are most of what a sweep writes and are of no use once all runs
     /// are cached. Other files of their folder stay.
     fn remove_maps(&self) -> Result<()> {
-        let kept = self.kept_maps();
-        // Methods that share an encoder share a file of maps.
-        let mut files = BTreeSet::new();
+        let kept = self.experiment.kept_maps(&self.maps());
         let all: Vec<usize> = (0..self.points.len()).collect();
         for weights in self.encoders(&all)? {
             let (scenarios, digests) = (&self.data.scenarios, &self.data.digests);
-            files.insert(FeatureStore::file(&kept, &weights, scenarios, digests)?);
+            // Methods that share an encoder share a file, which is gone the second time.
+            remove(&FeatureStore::file(&kept, &weights, scenarios, digests)?)?;
         }
-        files.iter().try_for_each(|file| remove(file))?;
         // The folder stays where it holds anything else.
         let _ = fs::remove_dir(self.maps());
         Ok(())
@@ -386,12 +370,12 @@ impl ExperimentSweep {
             remove(&self.out.join(name).with_extension("svg"))?;
             remove(&self.out.join(name).with_extension("png"))?;
         }
-        for figure in charts::figures(&self.experiment, runs) {
-            let path = self.out.join(figure.name);
-            write(&path.with_extension("svg"), &figures::svg(&figure.charts)?)?;
-            figures::save_png(&figure.charts, &path.with_extension("png"))?;
+        for (name, charts) in charts::figures(&self.experiment, runs) {
+            let path = self.out.join(name);
+            write(&path.with_extension("svg"), &figures::svg(&charts)?)?;
+            figures::save_png(&charts, &path.with_extension("png"))?;
             // On the page each chart is an image of its own, so that they wrap on a narrow screen.
-            let each = figure.charts.chunks(1).map(figures::svg);
+            let each = charts.chunks(1).map(figures::svg);
             drawings.push(each.collect::<Result<Vec<_>, _>>()?);
         }
         let columns: Vec<&str> = table::COLUMNS.split(',').collect();

@@ -5,11 +5,14 @@
 
 mod text;
 
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context, Result};
+use anyhow::{Context, Result, anyhow, bail};
 use support::atomic_file;
 use support::cli::NotWritten;
+use support::file_digests::FileDigests;
+use support::output;
 
 pub use text::{csv, markdown};
 
@@ -18,15 +21,7 @@ use super::evaluation::{OpenedData, Trial, compute};
 use super::slices::Slice;
 use super::spec::{Column, Experiment, Row, Table};
 use super::sweep::generate;
-
-/// The cells of a row: for each column one per training.
-#[derive(Debug, Clone, PartialEq)]
-pub struct FilledRow {
-    /// Method and first column of the row.
-    pub row: Row,
-    /// Column by column, training by training.
-    pub cells: Vec<Vec<Cell>>,
-}
+use crate::scenario::weights_choice::weights_of;
 
 /// A table with all its values.
 #[derive(Debug, Clone, PartialEq)]
@@ -35,20 +30,13 @@ pub struct FilledTable {
     pub name: String,
     /// Conditions.
     pub columns: Vec<Column>,
-    /// Its rows.
-    pub rows: Vec<FilledRow>,
-}
-
-/// Observer of the progress of tables.
-pub trait TableObserver {
-    /// A cell is next; `known` if it was computed before.
-    fn cell(&mut self, table: &str, row: &str, column: &str, known: bool);
-    /// A frame has been evaluated.
-    fn frame(&mut self);
+    /// Its rows, each with its cells: column by column, training by training.
+    pub rows: Vec<(Row, Vec<Vec<Cell>>)>,
 }
 
 /// Computes the missing cells and writes every table into `out`: `NAME.md`, `NAME.csv`, and `cells/`. Of a slice only
-/// its cells are computed, and no table is written.
+/// its cells are computed, and no table is written. `on_cell` is called before every cell, with its place as text and true
+/// if it was computed before; `on_frame` after every frame.
 ///
 /// # Errors
 /// An error at the first cell that cannot be computed; earlier cells are cached.
@@ -56,12 +44,15 @@ pub fn run(
     experiment: &Experiment,
     out: &Path,
     slice: Option<Slice>,
-    observer: &mut dyn TableObserver,
+    on_cell: &mut dyn FnMut(&str, bool),
+    on_frame: &mut dyn FnMut(),
 ) -> Result<Vec<FilledTable>> {
     let cells = out.join("cells");
     atomic_file::create_folder(&cells).with_context(|| NotWritten(cells.clone()))?;
     generate(experiment)?;
     let data = OpenedData::open(&experiment.trial()?)?;
+    let lacking = data.lacking(experiment.scenarios, experiment.frames);
+    lacking.into_iter().for_each(output::note);
     let run = TableRun {
         experiment,
         cells,
@@ -70,7 +61,8 @@ pub fn run(
     let places = run.places()?;
     run.check_participants(&places)?;
     let part = slice.map_or(0..places.len(), |slice| slice.part(places.len()));
-    let cells = places[part].iter().map(|place| run.cell(place, observer));
+    let cells = places[part].iter();
+    let cells = cells.map(|place| run.cell(place, on_cell, on_frame));
     let cells = cells.collect::<Result<Vec<_>>>()?;
     // Cells of other slices may still be missing, so no table can be filled.
     if slice.is_some() {
@@ -87,6 +79,19 @@ pub fn run(
         filled.push(table);
     }
     Ok(filled)
+}
+
+/// Refuses trainings of a row that are one, by another path or as a copy: their standard deviation would be 0.
+fn check_trainings(row: &Row, digests: &FileDigests) -> Result<()> {
+    let mut known = BTreeMap::new();
+    for weights in &row.weights {
+        let file = weights_of(weights, row.method, row.boxes.is_some())?;
+        if let Some(same) = known.insert(digests.of(&file)?, weights) {
+            let (row, [same, other]) = (row.label(), [same, weights].map(|file| file.display()));
+            bail!("row {row}: weights {same} and {other} have the same contents");
+        }
+    }
+    Ok(())
 }
 
 struct TableRun<'a> {
@@ -110,6 +115,8 @@ impl TableRun<'_> {
         let mut places = Vec::new();
         for table in &self.experiment.tables {
             for row in &table.rows {
+                let checked = check_trainings(row, &self.data.digests);
+                checked.map_err(|problem| anyhow!("table {:?}, {problem}", table.name))?;
                 for column in &table.columns {
                     let trainings = self.experiment.trainings_of(row)?.into_iter();
                     places.extend(trainings.map(|weights| CellPlace {
@@ -142,12 +149,9 @@ impl TableRun<'_> {
         let mut rows = Vec::with_capacity(table.rows.len());
         for row in &table.rows {
             let trainings = self.experiment.trainings_of(row)?.len();
-            rows.push(FilledRow {
-                row: row.clone(),
-                cells: (table.columns.iter())
-                    .map(|_| cells.by_ref().take(trainings).collect())
-                    .collect(),
-            });
+            let columns = table.columns.iter();
+            let of_row = columns.map(|_| cells.by_ref().take(trainings).collect());
+            rows.push((row.clone(), of_row.collect()));
         }
         Ok(FilledTable {
             name: table.name.clone(),
@@ -156,16 +160,21 @@ impl TableRun<'_> {
         })
     }
 
-    fn cell(&self, place: &CellPlace<'_>, observer: &mut dyn TableObserver) -> Result<Cell> {
+    fn cell(
+        &self,
+        place: &CellPlace<'_>,
+        on_cell: &mut dyn FnMut(&str, bool),
+        on_frame: &mut dyn FnMut(),
+    ) -> Result<Cell> {
         let trial = self.trial(place)?;
         let key = trial.key(&self.data, place.row.method)?;
         let known = Cell::read(&key, &self.cells)?;
-        let (table, column) = (&place.table.name, &place.column.name);
-        observer.cell(table, &place.row.label(), column, known.is_some());
+        let (table, row, column) = (&place.table.name, place.row.label(), &place.column.name);
+        on_cell(&format!("{table}: {row}, {column}"), known.is_some());
         if let Some(cell) = known {
             return Ok(cell);
         }
-        let cell = compute(&trial, &self.data, key, &mut || observer.frame())?;
+        let cell = compute(&trial, &self.data, key, on_frame)?;
         cell.write(&self.cells)?;
         Ok(cell)
     }
@@ -184,5 +193,34 @@ impl TableRun<'_> {
         let folder = self.experiment.feature_maps.as_ref();
         trial.maps = folder.map(|folder| self.experiment.kept_maps(folder));
         Ok(trial)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+
+    use super::*;
+
+    #[test]
+    fn a_training_that_is_named_twice_is_refused_by_whatever_path() {
+        let folder = tempfile::tempdir().unwrap();
+        for (name, contents) in [("a", "first"), ("b", "second"), ("copy", "first")] {
+            fs::write(folder.path().join(name), contents).unwrap();
+        }
+        let problem = |names: &[&str]| {
+            let row = Row {
+                weights: names.iter().map(|name| folder.path().join(name)).collect(),
+                ..serde_saphyr::from_str("method: max").unwrap()
+            };
+            let checked = check_trainings(&row, &FileDigests::default()).err();
+            checked.map_or(String::new(), |problem| problem.to_string())
+        };
+        assert_eq!(problem(&["a", "b"]), "");
+        for other in ["./a", "copy"] {
+            let problem = problem(&["a", "b", other]);
+            assert!(problem.contains("row max: weights ") && problem.contains("same contents"));
+            assert!(problem.contains(&format!("/{other} have")), "{problem}");
+        }
     }
 }

@@ -8,7 +8,7 @@ use deploy::operate::run_folder::fixed;
 use support::csv_file::CsvText;
 use support::statistics;
 
-use super::{FilledRow, FilledTable};
+use super::FilledTable;
 use crate::experiment::cell::{Cell, sources};
 
 /// Markdown table: AP@0.3/0.5/0.7 in per cent. A single column of conditions is expanded into both orderings and bytes;
@@ -31,17 +31,13 @@ pub fn markdown(table: &FilledTable) -> String {
     // Writing to a string cannot fail.
     let _ = writeln!(text, "| method | {} |", heads.join(" | "));
     let _ = writeln!(text, "| --- |{}", " --- |".repeat(heads.len()));
-    for FilledRow { row, cells } in &table.rows {
+    for (row, cells) in &table.rows {
         let headlines = cells.iter().map(|cells| precision(cells, orders[0]));
         let mut values: Vec<String> = headlines.collect();
         if let [cells] = &cells[..] {
-            let payload = mean(cells, &|cell| cell.metrics.comm.payload_bytes_mean);
-            let log2 = mean(cells, &|cell| cell.metrics.comm.log2_payload);
-            values.extend([
-                precision(cells, orders[1]),
-                number(&payload, 0),
-                number(&log2, 2),
-            ]);
+            let payload = mean(cells, 0, &|cell| cell.metrics.comm.payload_bytes_mean);
+            let log2 = mean(cells, 2, &|cell| cell.metrics.comm.log2_payload);
+            values.extend([precision(cells, orders[1]), payload, log2]);
         }
         let _ = writeln!(text, "| {} | {} |", row.label(), values.join(" | "));
     }
@@ -53,7 +49,7 @@ pub fn markdown(table: &FilledTable) -> String {
 
 fn cells_of(table: &FilledTable) -> impl Iterator<Item = &Cell> {
     let rows = table.rows.iter();
-    rows.flat_map(|row| row.cells.iter().flatten())
+    rows.flat_map(|(_, cells)| cells.iter().flatten())
 }
 
 /// Provenance of the values: frames, programs, data, and every other file.
@@ -77,7 +73,7 @@ pub fn csv(table: &FilledTable) -> String {
          ap_frame_50,ap_frame_70,payload_bytes_mean,log2_payload,pose_mean_m,pose_p95_m,no_pose,commit,program_sha256,\
          data_sha256,files_sha256",
     );
-    for FilledRow { row, cells } in &table.rows {
+    for (row, cells) in &table.rows {
         for (column, trainings) in table.columns.iter().zip(cells) {
             for (training, cell) in trainings.iter().enumerate() {
                 let place = [
@@ -121,33 +117,29 @@ fn cell_fields(cell: &Cell) -> Vec<String> {
     fields
 }
 
-/// Mean over trainings, and their standard deviation where there are several.
-fn mean(cells: &[Cell], value: &dyn Fn(&Cell) -> Option<f64>) -> Option<(f64, Option<f64>)> {
+/// Mean over trainings, and their standard deviation where there are several, as text.
+fn mean(cells: &[Cell], digits: usize, value: &dyn Fn(&Cell) -> Option<f64>) -> String {
     // One training without a value makes the mean unknown: that of the others would mislead.
     let values: Option<Vec<f64>> = cells.iter().map(value).collect();
-    let values = values?;
-    let mean = statistics::mean(&values)?;
+    let values = values.unwrap_or_default();
+    let Some(mean) = statistics::mean(&values) else {
+        return "-".into();
+    };
+    if values.len() == 1 {
+        return format!("{mean:.digits$}");
+    }
     let square: f64 = values.iter().map(|value| (value - mean).powi(2)).sum();
     // Sample standard deviation, divided by the number of trainings less one.
-    let deviation = (values.len() > 1).then(|| (square / (values.len() - 1) as f64).sqrt());
-    Some((mean, deviation))
-}
-
-fn number(value: &Option<(f64, Option<f64>)>, digits: usize) -> String {
-    match value {
-        None => "-".into(),
-        Some((mean, None)) => format!("{mean:.digits$}"),
-        Some((mean, Some(deviation))) => format!("{mean:.digits$} ± {deviation:.digits$}"),
-    }
+    let deviation = (square / (values.len() - 1) as f64).sqrt();
+    format!("{mean:.digits$} ± {deviation:.digits$}")
 }
 
 /// Three precisions in per cent.
 fn precision(cells: &[Cell], order: ApOrder) -> String {
     let precisions = [0, 1, 2].map(|index: usize| {
-        let percent = mean(cells, &|cell| {
+        mean(cells, 2, &|cell| {
             Some(100.0 * cell.metrics.ap_in(order).values()[index]?)
-        });
-        number(&percent, 2)
+        })
     });
     precisions.join(" / ")
 }
@@ -215,7 +207,7 @@ mod tests {
         }
     }
 
-    fn filled_row(method: Method, trainings: &[f64], columns: usize) -> FilledRow {
+    fn filled_row(method: Method, trainings: &[f64], columns: usize) -> (Row, Vec<Vec<Cell>>) {
         let row = Row {
             name: Some(format!("{method}, here")),
             method,
@@ -227,10 +219,7 @@ mod tests {
             box_alignment: false,
         };
         let cells: Vec<Cell> = trainings.iter().map(|&at_50| cell(method, at_50)).collect();
-        FilledRow {
-            row,
-            cells: vec![cells; columns],
-        }
+        (row, vec![cells; columns])
     }
 
     fn table(columns: &[&str]) -> FilledTable {
@@ -256,7 +245,7 @@ mod tests {
             for cell in table
                 .rows
                 .iter_mut()
-                .flat_map(|row| row.cells.iter_mut().flatten())
+                .flat_map(|(_, cells)| cells.iter_mut().flatten())
             {
                 cell.metrics.protocol = EvaluationProtocol::preset("v2v4real");
                 cell.metrics.ap_frame_order.at_50 = Some(0.125);

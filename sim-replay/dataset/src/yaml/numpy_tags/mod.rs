@@ -26,18 +26,8 @@ const PACKAGES: [&str; 2] = ["numpy.core", "numpy._core"];
 /// Most numbers in an array; a pose has 16.
 const MAX_NUMBERS: usize = 4096;
 
-/// An array of numbers, row-major.
-#[derive(Debug, Clone, PartialEq)]
-pub(crate) struct NumpyArray {
-    pub(crate) shape: Vec<usize>,
-    pub(crate) values: Vec<f64>,
-}
-
-impl NumpyArray {
-    pub(crate) fn new(shape: Vec<usize>, values: Vec<f64>) -> Self {
-        Self { shape, values }
-    }
-}
+/// Shape and numbers of an array, row-major.
+pub(crate) type NumpyArray = (Vec<usize>, Vec<f64>);
 
 /// True if the node carries a tag of Python's.
 pub(crate) fn is_python(node: &YamlNode) -> bool {
@@ -65,7 +55,7 @@ pub(crate) fn array(field: &YamlField<'_>) -> Result<NumpyArray> {
         Some("multiarray.scalar") => {
             let [dtype, data] = items::<2>(&args(field)?)?;
             let values = numbers(&data, read_dtype(&dtype)?, 1)?;
-            Ok(NumpyArray::new(vec![], values))
+            Ok((vec![], values))
         }
         _ => {
             let tag = shown(field.node.tag.as_deref());
@@ -78,7 +68,7 @@ pub(crate) fn array(field: &YamlField<'_>) -> Result<NumpyArray> {
 
 /// Reads `scalar(dtype, data)` or an array with one number; it must be finite.
 pub(crate) fn scalar(field: &YamlField<'_>) -> Result<f64> {
-    let NumpyArray { shape, values } = array(field)?;
+    let (shape, values) = array(field)?;
     match values[..] {
         [value] if value.is_finite() => Ok(value),
         [value] => Err(field.error(format!("{value}, expected a finite number"))),
@@ -202,7 +192,7 @@ fn ordered(shape: Vec<usize>, values: Vec<f64>, is_fortran: bool) -> NumpyArray 
         true => row_major(&shape, &values),
         false => values,
     };
-    NumpyArray { shape, values }
+    (shape, values)
 }
 
 /// Converts the order in which the first index runs fastest to row-major.

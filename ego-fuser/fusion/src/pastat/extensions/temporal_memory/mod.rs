@@ -146,8 +146,7 @@ impl TemporalMemory {
             .f_flatten(0, 2)?
             .f_index_select(0, &at.near)?;
         let shown = cells.f_index_select(0, &at.near)?;
-        let known =
-            beside(&self.now, &shown, &at.around)? + self.token_features(ego, &at.patches)?;
+        let known = beside(&self.now, &shown, &at)? + self.token_features(ego, &at.patches)?;
         let now = shown.f_index_select(0, &at.middle)?;
         let gate = self.gate(0, &own, &known, &at)?;
         let mut change = gate * (own.f_index_select(0, &at.middle)? - &now);
@@ -171,7 +170,7 @@ impl TemporalMemory {
     /// `[P, C]`: weight of the `features` `[R, C]` of a time step, given the tokens' features `known` `[P, hidden]`.
     fn gate(&self, step: usize, features: &Tensor, known: &Tensor, at: &Places) -> Result<Tensor> {
         let step = self.step.f_get(step as i64)?;
-        let hidden = (beside(&self.past, features, &at.around)? + known + step).f_relu()?;
+        let hidden = (beside(&self.past, features, at)? + known + step).f_relu()?;
         hidden
             .f_linear(&self.gate.ws.f_flatten(1, 3)?, self.gate.bs.as_ref())?
             .f_tanh()
@@ -219,8 +218,11 @@ struct Places {
     cells: Tensor,
     /// `[R]`, of these cells and their neighbours.
     near: Tensor,
-    /// For each cell the 3x3 cells of `near` around it.
-    around: Around,
+    /// `[P * 9]`: the results of a convolution's nine weights that each cell needs of the 3x3 cells of `near` around it,
+    /// as rows of all results, nine for each cell that is shown.
+    results: Tensor,
+    /// `[P]`: where those of each cell begin.
+    first: Tensor,
     /// `[P]`: for each cell its own index in `near`.
     middle: Tensor,
 }
@@ -231,35 +233,18 @@ impl Places {
         let near: Vec<i64> = near
             .map(|&[row, column]| row as i64 * width + column as i64)
             .collect();
+        // The index after the last of `near` is beyond the edge.
         let around = tensor(&selection.around, &[-1, AROUND], device)?;
+        let options = (Kind::Int64, device);
+        // The k-th cell around contributes its result of weight k: row 9 * cell + k.
+        let results = (&around * AROUND + Tensor::f_arange(AROUND, options)?).f_flatten(0, 1)?;
         Ok(Self {
             patches: tensor(&selection.patches, &[-1], device)?,
             cells: tensor(&selection.cells, &[-1], device)?,
             near: tensor(&near, &[-1], device)?,
-            middle: around.f_select(1, AROUND / 2)?,
-            around: Around::of(&around)?,
-        })
-    }
-}
-
-/// The results of a convolution's nine weights that each of some cells needs.
-struct Around {
-    /// `[P * 9]`: rows of all results, nine for each cell that is shown.
-    results: Tensor,
-    /// `[P]`: where those of each cell begin.
-    first: Tensor,
-}
-
-impl Around {
-    /// Given the indices `[P, 9]` of the cells around each among those that are shown; the index after the last is
-    /// beyond the edge.
-    fn of(around: &Tensor) -> Result<Self> {
-        let options = (Kind::Int64, around.device());
-        // The k-th cell around contributes its result of weight k: row 9 * cell + k.
-        let results = (around * AROUND + Tensor::f_arange(AROUND, options)?).f_flatten(0, 1)?;
-        Ok(Self {
-            first: Tensor::f_arange(around.size2()?.0, options)? * AROUND,
             results,
+            first: Tensor::f_arange(around.size2()?.0, options)? * AROUND,
+            middle: around.f_select(1, AROUND / 2)?,
         })
     }
 }
@@ -268,7 +253,7 @@ impl Around {
 ///
 /// Each cell is multiplied with all nine weights first: the nine results that a cell needs are fewer numbers than the
 /// features of nine cells.
-fn beside(convolution: &nn::Conv2D, shown: &Tensor, around: &Around) -> Result<Tensor> {
+fn beside(convolution: &nn::Conv2D, shown: &Tensor, at: &Places) -> Result<Tensor> {
     let hidden = convolution.ws.size4()?.0;
     // [hidden, C, 3, 3] to [9 * hidden, C], weights in the order of the cells around.
     let weight = convolution.ws.f_permute([2, 3, 0, 1])?.f_flatten(0, 2)?;
@@ -277,7 +262,7 @@ fn beside(convolution: &nn::Conv2D, shown: &Tensor, around: &Around) -> Result<T
     let results = shown
         .f_linear(&weight, None::<&Tensor>)?
         .f_view([-1, hidden])?;
-    let (rows, first) = (&around.results, &around.first);
+    let (rows, first) = (&at.results, &at.first);
     let unweighted = None::<&Tensor>;
     let (sums, ..) =
         Tensor::f_embedding_bag(&results, rows, first, false, SUM, false, unweighted, false)?;
@@ -331,8 +316,8 @@ mod tests {
             .squeeze_dim(0)
             .transpose(0, 1)
             .index_select(0, &Tensor::from_slice(&near));
-        let around = Tensor::from_slice(&selection.around).view([-1, AROUND]);
-        let some = beside(&convolution, &shown, &Around::of(&around).unwrap()).unwrap();
+        let at = Places::of(&selection, 6, Device::Cpu).unwrap();
+        let some = beside(&convolution, &shown, &at).unwrap();
         let expected = all.index_select(0, &Tensor::from_slice(&selection.cells));
         assert!(some.allclose(&expected, 1e-5, 1e-5, false));
     }

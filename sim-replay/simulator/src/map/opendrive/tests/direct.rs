@@ -30,8 +30,8 @@ pub(super) const EXIT: &str = r#"<OpenDRIVE>
 fn graph(text: &str) -> LaneGraph {
     let network = read(text).unwrap();
     assert_eq!(network.findings, []);
-    let (graph, counts) = lane_builder::lane_graph(&network);
-    assert_eq!(counts.refused, 0);
+    let (graph, findings) = lane_builder::lane_graph(&network);
+    assert_eq!(refused(&findings), 0);
     graph
 }
 

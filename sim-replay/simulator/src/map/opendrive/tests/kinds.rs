@@ -312,42 +312,35 @@ fn parts_that_are_not_built_are_reported() {
 #[test]
 fn sections_without_lane_links_continue_where_they_are_one_lane_and_links_that_do_not_meet_are_named()
  {
-    let counts = |text: &str| lane_builder::lane_graph(&read(text).unwrap()).1;
+    let linked = |text: &str| {
+        let (graph, findings) = lane_builder::lane_graph(&read(text).unwrap());
+        (made(&graph), refused(&findings), findings)
+    };
     let unlinked = |text: &str| {
         ["<successor id=\"-2\"/>", "<predecessor id=\"-2\"/>"]
             .iter()
             .fold(text.to_owned(), |text, link| text.replacen(link, "", 1))
     };
-    let linked = counts(BORDERS);
-    assert_eq!(
-        (linked.made, linked.refused, linked.findings.len()),
-        (3, 0, 0)
-    );
-    let found = counts(&unlinked(BORDERS));
+    assert_eq!(linked(BORDERS), (3, 0, vec![]));
+    let (links, _, found) = linked(&unlinked(BORDERS));
     let named = "road 1: <link> leads from lane -2 to no lane, though lane -2 continues; lanes of one id linked";
-    assert_eq!(
-        (found.made, found.findings[0].to_string().as_str()),
-        (3, named)
-    );
+    assert_eq!((links, found[0].to_string().as_str()), (3, named));
     // A lane that is linked from one side only, or is another one, ends.
     assert_eq!(
-        counts(&BORDERS.replacen("<successor id=\"-2\"/>", "", 1)).made,
+        linked(&BORDERS.replacen("<successor id=\"-2\"/>", "", 1)).0,
         2
     );
     let narrow = r#"<border sOffset="0" a="5" b="0" c="0" d="0"/>"#;
     assert_eq!(
-        counts(&unlinked(&BORDERS.replacen(
+        linked(&unlinked(&BORDERS.replacen(
             narrow,
             &narrow.replace("5", "3.2"),
             1
         )))
-        .made,
+        .0,
         2
     );
-    let apart = counts(&SMALL.replacen(r#"x="50" y="0""#, r#"x="50" y="1""#, 1));
+    let (_, refused, found) = linked(&SMALL.replacen(r#"x="50" y="0""#, r#"x="50" y="1""#, 1));
     let named = "road a: <laneLink> leads from lane -1 onto lane -1 of road b, 1.00 m away, 0.00 m in height, turned by 0.02 rad; link left out";
-    assert_eq!(
-        (apart.refused, apart.findings[0].to_string().as_str()),
-        (1, named)
-    );
+    assert_eq!((refused, found[0].to_string().as_str()), (1, named));
 }
