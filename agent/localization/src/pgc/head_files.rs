@@ -64,8 +64,11 @@ fn released_file(head: &Path, kind: &str, prefix: &str, trained: &str) -> Result
             .filter_map(|file| Some(file.file_stem()?.to_str()?.strip_prefix(prefix)?.to_owned()));
         // A folder may be reached by two paths.
         let released: BTreeSet<String> = stems.filter(|name| name != "encoder").collect();
-        let released = Vec::from_iter(released).join(", ");
-        let problem = format_args!("no such file or released {kind}; released are {released}");
+        let released = match Vec::from_iter(released).join(", ") {
+            none if none.is_empty() => "no folder deploy/weights here or above".into(),
+            names => format!("released are {names}"),
+        };
+        let problem = format_args!("no such file or released {kind}; {released}");
         FileError::new(head, problem)
     })
 }

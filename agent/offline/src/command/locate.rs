@@ -138,13 +138,16 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     let localizer = place_localizer(files, args.min_confidence, inference, |_| ());
     let mut localizer = localizer.map_err(BadInput::of)?;
     let place = localizer.place().unwrap_or_default().to_owned();
-    let (mut found, mut lost, mut bad) = (0, 0, 0);
+    let (mut found, mut lost, mut bad, mut remembered) = (0, 0, 0, 0);
     let (mut points, mut sweeps, mut lowest) = (Vec::new(), Vec::new(), Vec::new());
     for file in clouds_at(&args.clouds) {
         let located = args.locate(&mut *localizer, &place, file, &mut sweeps)?;
         match (&located.error, &located.pose) {
             (Some(_), _) => bad += 1,
-            (None, Some(_)) => found += 1,
+            (None, Some(pose)) => {
+                found += 1;
+                remembered += usize::from(!pose.registered);
+            }
             (None, None) => {
                 lost += 1;
                 lowest.extend(located.lowest_m);
@@ -163,6 +166,11 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     if found + lost + bad > 1 {
         output::note(format_args!(
             "{found} clouds found, {lost} without a pose, {bad} cannot be read"
+        ));
+    }
+    if remembered > 0 {
+        output::note(format_args!(
+            "height, roll and pitch of {remembered} poses are those of the head's drives, not measured: --surfel-map measures them"
         ));
     }
     if found == 0 && lost > 0 {
