@@ -212,7 +212,7 @@ impl ScenarioFolder {
     }
 
     /// Capture times of all stems. Stems that are times give them, from the first on. Others count simulator ticks: if
-    /// `data_protocol.yaml` gives the length of a tick, time is tick times length; else the usual step between stems is
+    /// `data_protocol.yaml` gives the length of a tick, time is tick times length; else the median step between stems is
     /// one `period_nanos`, from 0 on.
     pub(super) fn ticks(&self, period_nanos: u64, problems: &mut Vec<ReadError>) -> Vec<Tick> {
         let tick_nanos = self.tick_nanos().unwrap_or_else(|error| {
@@ -254,7 +254,7 @@ impl ScenarioFolder {
         Some(ReadError::malformed(&self.dir, reason))
     }
 
-    /// The step in the middle of those between frames. Where it is rare, as in a random choice of frames, and all others
+    /// The median step between frames. Where it is rare, as in a random choice of frames, and all others
     /// are multiples of the smallest one, that is used.
     fn usual_step(&self, frames: &[(&str, u64)], problems: &mut Vec<ReadError>) -> u64 {
         let steps = frames.array_windows();
@@ -272,7 +272,7 @@ impl ScenarioFolder {
         }
         if !is_unit(usual) {
             let reason = format!(
-                "frame numbers in steps of {least} to {most}: {usual}, the one in the middle, is taken for one period"
+                "frame numbers in steps of {least} to {most}: {usual}, their median, is taken for one period"
             );
             problems.push(ReadError::malformed(&self.dir, reason));
         }
@@ -566,8 +566,7 @@ mod tests {
         let (frames, last, problems) = times();
         assert_eq!((frames, last, problems.len()), (21, 2050, 1));
         let problem = problems[0].to_string();
-        let end =
-            "frame numbers in steps of 2 to 3: 2, the one in the middle, is taken for one period";
+        let end = "frame numbers in steps of 2 to 3: 2, their median, is taken for one period";
         assert!(problem.ends_with(end), "{problem}");
         frame(123_456_789);
         let (frames, last, problems) = times();

@@ -378,7 +378,10 @@ mod tests {
         ] {
             let (joins, problems) = joined(&[], &[other], 12);
             assert_eq!(joins, ["12 poses of poses.txt by order"], "{other}");
-            assert_eq!(problems, [expected]);
+            assert!(
+                problems.len() == 1 && problems[0].ends_with(expected),
+                "{problems:?}"
+            );
         }
     }
 

@@ -11,6 +11,9 @@ use support::statistics;
 
 /// Largest number of points of a sweep used for its median.
 const MEDIAN_OF: usize = 4096;
+/// Height of the middle four fifths of a sweep's points above which z does not point up: in multiples of their smaller
+/// width along x and y, and in metres. A street of houses is below the former, a slope below the latter.
+const UPRIGHT: (f64, f64) = (4.0, 5.0);
 /// Fewer points than this may all have the same intensity.
 const LEAST_POINTS: usize = 20;
 
@@ -41,6 +44,8 @@ pub struct SweepFindings {
     above_one: usize,
     below_zero: usize,
     plausibility: Plausibility,
+    /// Distances from the lower to the upper tenth of x, y and z, metres.
+    spread_m: Option<[f64; 3]>,
 }
 
 impl SweepFindings {
@@ -65,8 +70,36 @@ impl SweepFindings {
             above_one: values.clone().filter(|&value| value > 1.0).count(),
             below_zero: values.filter(|&value| value < 0.0).count(),
             plausibility: Plausibility::of(&cloud.points),
+            spread_m: spread_m(&cloud.points.xyzi, step),
         }
     }
+}
+
+/// Distances from the lower to the upper tenth of x, y and z; `None` of few points.
+fn spread_m(points: &[[f32; 4]], step: usize) -> Option<[f64; 3]> {
+    let along = |axis: usize| {
+        let values = points.iter().step_by(step);
+        let values = values.map(|point| f64::from(point[axis]));
+        let sorted = statistics::sorted(&values.collect::<Vec<_>>());
+        Some(statistics::quantile(&sorted, 0.9)? - statistics::quantile(&sorted, 0.1)?)
+    };
+    let enough = points.len() >= LEAST_POINTS;
+    enough.then_some([along(0)?, along(1)?, along(2)?])
+}
+
+/// Names an axis beside z that points up.
+fn axes_fault(sweeps: &[&SweepFindings]) -> Option<String> {
+    let spreads = sweeps.iter().filter_map(|sweep| sweep.spread_m);
+    let spreads: Vec<[f64; 3]> = spreads.collect();
+    let of = |axis: usize| -> Vec<f64> { spreads.iter().map(|spread| spread[axis]).collect() };
+    let [x, y, z] = [0, 1, 2].map(|axis| statistics::median(&of(axis)));
+    let (x, y, z, (ratio, least_m)) = (x?, y?, z?, UPRIGHT);
+    (z > least_m && z > ratio * x.min(y)).then(|| {
+        format!(
+            "from the lower to the upper tenth they have {x:.1} m along x, {y:.1} m along y and {z:.1} m along z: z must point \
+             up, as in the frame of a LiDAR (not of a camera)"
+        )
+    })
 }
 
 #[expect(clippy::cast_possible_truncation, reason = "of f32")]
@@ -107,7 +140,8 @@ pub(super) fn problems(
     sweeps
         .iter()
         .for_each(|sweep| plausibility.join(&sweep.plausibility));
-    let points = plausibility.fault().map(|fault| ("x y z", fault));
+    let fault = plausibility.fault().or_else(|| axes_fault(sweeps));
+    let points = fault.map(|fault| ("x y z", fault));
     let intensity = intensity_fault(&report, sweeps, scale).map(|fault| ("intensity", fault));
     let path = folder.display().to_string();
     let faults = points.into_iter().chain(intensity);

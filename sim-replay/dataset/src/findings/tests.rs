@@ -1,5 +1,7 @@
 use std::fs;
 
+use protocol::PointCloud;
+
 use super::*;
 use crate::OpenOptions;
 use crate::frame::{Object, ObjectClass};
@@ -146,6 +148,38 @@ fn intensities_far_below_one_are_named() {
     let part = "the largest of 800 intensities is 3.80e-3 (field intensity divided by 1), expected 0.02 to 1";
     assert!(found[0].contains(part), "{found:?}");
     assert!(scene_findings(dir.path(), 0, 0.002, None).is_empty());
+}
+
+/// Problem of a sweep of a street that is 8 m wide and 60 m long, between walls of 6 m, whose axes are in this order.
+fn axes_finding(order: [usize; 3]) -> Option<String> {
+    let points = (0..3000).map(|k| {
+        let (along, around) = ((k % 60) as f32 - 30.0, (k / 60) as f32 * 0.4);
+        let [side, up] = match around {
+            ..6.0 => [-4.0, around],
+            6.0..14.0 => [around - 10.0, 0.0],
+            _ => [4.0, (around - 14.0).min(6.0)],
+        };
+        let point = [along, side, up - 1.9];
+        [point[order[0]], point[order[1]], point[order[2]], 0.1]
+    });
+    let cloud = PcdCloud {
+        points: PointCloud {
+            xyzi: points.collect(),
+        },
+        ..PcdCloud::default()
+    };
+    let sweep = SweepFindings::of(&cloud);
+    let found = of_clouds(Path::new("clouds"), &[&sweep], IntensityScale::AUTO);
+    let mut found = found.into_iter().map(|problem| problem.to_string());
+    found.find(|problem| problem.contains("x y z"))
+}
+
+#[test]
+fn axes_of_a_camera_are_named() {
+    assert_eq!(axes_finding([0, 1, 2]), None);
+    assert_eq!(axes_finding([1, 0, 2]), None);
+    let found = axes_finding([1, 2, 0]).unwrap();
+    assert!(found.contains("m along z: z must point up"), "{found}");
 }
 
 #[test]
