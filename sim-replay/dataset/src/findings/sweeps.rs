@@ -79,7 +79,7 @@ impl SweepFindings {
 fn spread_m(points: &[[f32; 4]], step: usize) -> Option<[f64; 3]> {
     let along = |axis: usize| {
         let values = points.iter().step_by(step);
-        let values = values.map(|point| f64::from(point[axis]));
+        let values = values.filter_map(|point| point.get(axis).copied().map(f64::from));
         let sorted = statistics::sorted(&values.collect::<Vec<_>>());
         Some(statistics::quantile(&sorted, 0.9)? - statistics::quantile(&sorted, 0.1)?)
     };
@@ -91,8 +91,13 @@ fn spread_m(points: &[[f32; 4]], step: usize) -> Option<[f64; 3]> {
 fn axes_fault(sweeps: &[&SweepFindings]) -> Option<String> {
     let spreads = sweeps.iter().filter_map(|sweep| sweep.spread_m);
     let spreads: Vec<[f64; 3]> = spreads.collect();
-    let of = |axis: usize| -> Vec<f64> { spreads.iter().map(|spread| spread[axis]).collect() };
-    let [x, y, z] = [0, 1, 2].map(|axis| statistics::median(&of(axis)));
+    let median = |axis: usize| {
+        let along = spreads
+            .iter()
+            .filter_map(|spread| spread.get(axis).copied());
+        statistics::median(&along.collect::<Vec<_>>())
+    };
+    let [x, y, z] = [0, 1, 2].map(median);
     let (x, y, z, (ratio, least_m)) = (x?, y?, z?, UPRIGHT);
     (z > least_m && z > ratio * x.min(y)).then(|| {
         format!(
