@@ -85,7 +85,7 @@ const OF_AN_EVALUATION: [Row; 32] = [
     ("--method late --dtype f16", 2, "late sends none"),
     ("--method none --trust", 2, "none uses none"),
     ("--method maxx", 2, "maxx"),
-    ("--method late,max", 2, "--method names max twice"),
+    ("--method max,max", 2, "--method names max twice"),
     ("--method script:{d}/none.pt", 2, "none.pt: No such file"),
     (
         "--weights {d}/none.safetensors",
