@@ -21,7 +21,7 @@ const WINDOW_NANOS: u64 = 1_300_000_000;
 const BACKLOG_NANOS: u64 = 500_000_000;
 /// Step between capture times of own sweeps beyond which the scene has jumped, nanoseconds: a replay that jumps back leaves
 /// a gap of 61 s.
-const JUMP_NANOS: u64 = 30_000_000_000;
+pub(crate) const JUMP_NANOS: u64 = 30_000_000_000;
 /// Largest number of sweeps and of samples that are kept of a vehicle.
 const MAX_KEPT: usize = 64;
 /// Largest number of vehicles.

@@ -8,6 +8,8 @@ use std::collections::VecDeque;
 
 use protocol::Pace;
 
+use crate::capture_clock::JUMP_NANOS;
+
 /// Shortest intervals whose longest is the period: fewer are odd steps of a recording or of a sensor.
 const SHORTEST: usize = 3;
 /// Number of frames that are judged together.
@@ -70,6 +72,11 @@ impl PaceControl {
         // The first frame, or one of a scene that has restarted.
         let last_nanos = last_nanos.filter(|last| *last < capture_nanos)?;
         let gap_nanos = capture_nanos - last_nanos;
+        if gap_nanos > JUMP_NANOS {
+            // The scene has jumped: no sweep was left out.
+            self.shortest_nanos.clear();
+            return None;
+        }
         self.shortest_nanos.push(gap_nanos);
         self.shortest_nanos.sort_unstable();
         self.shortest_nanos.truncate(SHORTEST);
@@ -263,6 +270,16 @@ mod tests {
             // From the tenth sweep on half a period earlier.
             let now = sweep * SWEEP_NANOS + nanos(if sweep < 10 { 50 } else { 0 });
             assert_eq!(control.judge(now, nanos(40), now), None, "{sweep}");
+        }
+    }
+
+    #[test]
+    fn laps_of_a_scene_are_no_overload() {
+        let (mut control, mut capture_nanos) = (PaceControl::new(), 0);
+        for sweep in 0..60u64 {
+            capture_nanos += SWEEP_NANOS + if sweep % 3 == 0 { 61 * nanos(1000) } else { 0 };
+            let changed = control.judge(capture_nanos, nanos(40), sweep * SWEEP_NANOS);
+            assert_eq!(changed, None, "{sweep}");
         }
     }
 

@@ -20,8 +20,8 @@ pub struct PairingConfig {
     pub depth: usize,
 }
 
-/// Last steps between sweeps of the ego whose median is their period: one odd step, and frames that are missing now and
-/// then, change nothing.
+/// Last steps between sweeps of the ego whose third shortest is their period: one odd step, and frames that are missing,
+/// change nothing.
 const STEPS: usize = 10;
 
 /// Shortest period of a LiDAR, nanoseconds: sweeps that follow each other faster are repeated ones.
@@ -112,8 +112,9 @@ impl<K: Ord + Clone, T> Pairing<K, T> {
         self.steps_nanos.truncate(STEPS);
         let mut sorted = Vec::from_iter(self.steps_nanos.iter().copied());
         sorted.sort_unstable();
-        // Of two in the middle the shorter one.
-        let period_nanos = sorted[(sorted.len() - 1) / 2];
+        // The shorter ones: also where most frames have one missing before them, as at a lower pace.
+        let count = sorted.len();
+        let period_nanos = sorted[((count - 1) / 4).max(usize::from(count > 2))];
         self.lead_nanos = self.config.max_lead_nanos.min(period_nanos / 2);
     }
 
@@ -296,6 +297,8 @@ mod tests {
         assert_eq!(lead_after(&[FRAME, half, FRAME]), half, "10 Hz");
         assert_eq!(lead_after(&[half, 700 * FRAME, half]), half / 2, "20 Hz");
         assert_eq!(lead_after(&[half, FRAME, half, FRAME]), half / 2, "gaps");
+        let paced = [[FRAME, FRAME, half]; 4].concat();
+        assert_eq!(lead_after(&paced), half / 2, "20 Hz at 6 of 10 sweeps");
         let slower = [[half; STEPS], [FRAME; STEPS]].concat();
         assert_eq!(lead_after(&slower), half, "the last steps count");
     }

@@ -18,6 +18,8 @@ const SHARE_STD: [f64; 2] = [1.960, 2.448];
 /// Fewest poses to fit a bound on: if none of them is beyond it, at most one in 1,000 of others is, with a confidence of
 /// 95 % (Wilks 1941). Of four times as many it is one in 4,000.
 const MIN_BOUND_POSES: usize = 2995;
+/// The same where the confidence above which the bound holds is chosen from these poses, too: two limits of one sample.
+const MIN_CHOSEN_POSES: usize = 4742;
 /// Smallest standard deviation to which a bound is a ratio, metres: maps of real places are not better than that.
 const BOUND_FLOOR_M: f64 = 0.01;
 /// Largest factor in a file.
@@ -37,7 +39,7 @@ pub struct CovarianceScale {
     pub yaw: f64,
     /// Largest error of a position of the fit, in standard deviations along the worst axis of the plane (of a registered
     /// pose with that of its start): at most one in 1,000 exceeds it, with a confidence of 95 %. `None` if it was fitted on
-    /// fewer than 2,995 poses.
+    /// fewer than 2,995 poses, or than 4,742 that are surer than a wrong one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub bound: Option<f64>,
     /// Confidence of the surest wrong pose of the fit: the bound is of poses above it. Absent if none was wrong.
@@ -170,7 +172,11 @@ impl CovarianceScale {
         });
         let ratios: Vec<f64> = ratios.collect();
         let bound = ratios.iter().copied().fold(0.0, f64::max);
-        match ratios.len() >= MIN_BOUND_POSES && bound <= MAX_FACTOR {
+        let least = match bound_above {
+            Some(_) => MIN_CHOSEN_POSES,
+            None => MIN_BOUND_POSES,
+        };
+        match ratios.len() >= least && bound <= MAX_FACTOR {
             true => Self {
                 bound: Some(bound),
                 ..scale
@@ -358,7 +364,7 @@ mod tests {
 
     #[test]
     fn poses_that_are_no_surer_than_a_wrong_one_have_no_bound() {
-        let mut all = samples(3200, [2.0; 6], 5);
+        let mut all = samples(5000, [2.0; 6], 5);
         let unsure = all.split_at_mut(200).0;
         unsure.iter_mut().for_each(|sample| sample.sigma = 0.7);
         unsure[7].error[0] = 40.0;
@@ -369,7 +375,7 @@ mod tests {
         let bounds = [0.7, 0.71].map(|sigma| scale.bound_m(sigma, &all[0].covariance, 0.0));
         assert!(bounds[0].is_none() && bounds[1].is_some());
         // Among the surest: too few are left.
-        all[3000].error[0] = 40.0;
+        all[4500].error[0] = 40.0;
         assert_eq!(CovarianceScale::fit(&all, WRONG_M).unwrap().bound, None);
     }
 

@@ -136,14 +136,21 @@ impl<'a> SweepOnMap<'a> {
 pub struct MapRegistration {
     localizer: Box<dyn Localize>,
     map: SurfelMap,
+    /// Confidence below which a pose that the registration contradicts is rejected.
+    min_confidence: f64,
 }
 
 impl MapRegistration {
-    /// Poses of a localizer, registered to the map in a file; without a file the localizer itself.
+    /// Poses of a localizer, registered to the map in a file; without a file the localizer itself. A pose that the
+    /// registration contradicts is rejected below `min_confidence`, as the localizer rejects its own.
     ///
     /// # Errors
     /// [`FileError`] as [`SurfelMap::load`], and of a map of another place than the localizer's.
-    pub fn of(localizer: Box<dyn Localize>, map: &Path) -> Result<Box<dyn Localize>, FileError> {
+    pub fn of(
+        localizer: Box<dyn Localize>,
+        map: &Path,
+        min_confidence: f64,
+    ) -> Result<Box<dyn Localize>, FileError> {
         if map.as_os_str().is_empty() {
             return Ok(localizer);
         }
@@ -160,6 +167,7 @@ impl MapRegistration {
             _ => Ok(Box::new(Self {
                 localizer,
                 map: surfels,
+                min_confidence,
             })),
         }
     }
@@ -183,6 +191,7 @@ impl Localize for MapRegistration {
             let registered = on_map.registered(&self.map, start);
             let registered =
                 registered.filter(|found| on_map.stands_on(&self.map, &found.world_from_sensor));
+            let registered = registered.map(|pose| doubted(&found, pose, self.min_confidence));
             localization = judged(localization, &found, registered);
             localization.times.lap(REGISTER);
         }
@@ -209,7 +218,7 @@ fn judged(
     registered: Option<FoundPose>,
 ) -> Localization {
     let judged = match registered {
-        Some(registered) => doubted(found, registered),
+        Some(registered) => registered,
         None if found.sigma >= SURE => return localization,
         None => FoundPose {
             is_rejected: true,
@@ -221,7 +230,7 @@ fn judged(
 
 /// A registered pose that knows where it began: far from a sure start it is doubted. A sweep that is not rigid, taken while
 /// driving without correction or by two LiDARs, fits its map beside its place, and closely.
-fn doubted(start: &FoundPose, registered: FoundPose) -> FoundPose {
+fn doubted(start: &FoundPose, registered: FoundPose, min_confidence: f64) -> FoundPose {
     let [from, to] = [start, &registered].map(|found| found.world_from_sensor.translation.vector);
     let off_m = (to - from).xy().norm();
     let [std_m, _] = unscaled_std(start);
@@ -238,6 +247,7 @@ fn doubted(start: &FoundPose, registered: FoundPose) -> FoundPose {
             judged.cell_covariance[axis][axis] += (off_m / scale.planar).powi(2);
         }
         judged.sigma = 1.0 / (1.0 / registered.sigma + 2.0 * off_m * off_m);
+        judged.is_rejected = judged.sigma < min_confidence;
     }
     judged
 }
@@ -313,7 +323,7 @@ mod tests {
             is_rejected: false,
         };
         let place = "yard";
-        let registration = MapRegistration::of(Box::new(Fixed { found, place }), &file);
+        let registration = MapRegistration::of(Box::new(Fixed { found, place }), &file, 0.0);
         (registration.unwrap(), found)
     }
 
@@ -441,7 +451,7 @@ mod tests {
         let localizers: [Box<dyn Localize>; 2] =
             [Box::new(fixed()), Box::new(Uncalibrated(fixed()))];
         let scaled = localizers.map(|localizer| {
-            let mut registration = MapRegistration::of(localizer, &file).unwrap();
+            let mut registration = MapRegistration::of(localizer, &file, 0.0).unwrap();
             let found = found_near(registration.as_mut(), truth);
             found.covariance_scale.is_some()
         });
@@ -453,7 +463,8 @@ mod tests {
         let (_folder, file, truth) = stored();
         let (_, found) = registration(truth, 0.9);
         let place = "town1";
-        let refused = MapRegistration::of(Box::new(Fixed { found, place }), &file).unwrap_err();
+        let refused =
+            MapRegistration::of(Box::new(Fixed { found, place }), &file, 0.0).unwrap_err();
         let message = refused.to_string();
         assert!(
             message.contains("\"yard\"") && message.contains("\"town1\""),

@@ -34,5 +34,5 @@ pub fn place_localizer(
         }
     };
     // Outermost: near a prediction the registration alone may suffice, without the networks.
-    Ok(MapRegistration::of(localizer, surfel_map)?)
+    Ok(MapRegistration::of(localizer, surfel_map, min_confidence)?)
 }

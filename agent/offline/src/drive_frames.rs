@@ -31,29 +31,34 @@ pub(crate) struct MappedDrive {
 }
 
 /// A problem for each drive whose sweeps agree with an offset only with those of the drive before it that it meets most,
-/// and the drives that meet none before them.
+/// and the drives of which too few sweeps agree with any before them.
 pub(crate) fn contradictions(drives: &[MappedDrive]) -> (Vec<Problem>, Vec<String>) {
-    let (mut problems, mut alone) = (Vec::new(), Vec::new());
+    let (mut problems, mut unchecked) = (Vec::new(), Vec::new());
     for (place, drive) in drives.iter().enumerate().skip(1) {
         let before = drives.iter().take(place);
         let meetings = before.map(|known| (known, drive.pairs(known)));
-        match meetings.max_by_key(|(_, pairs)| pairs.len()) {
-            Some((known, pairs)) if !pairs.is_empty() => {
-                problems.extend(drive.contradiction(known, &pairs));
+        let met = meetings.max_by_key(|(_, pairs)| pairs.len());
+        let agreed =
+            met.and_then(|(known, pairs)| Some((known, drive.usual_offset(known, &pairs)?)));
+        match agreed {
+            Some((known, (offset_m, counts))) if offset_m.norm() > AGREED_M => {
+                problems.push(drive.contradiction(known, &offset_m, counts));
             }
-            _ => alone.push(drive.folder()),
+            Some(_) => {}
+            None => unchecked.push(drive.name()),
         }
     }
-    (problems, alone)
+    (problems, unchecked)
 }
 
 impl MappedDrive {
-    /// Folder of its first sweep.
-    fn folder(&self) -> String {
+    /// Folder of its first sweep, and its scenario.
+    fn name(&self) -> String {
         let first = self.sweeps.first();
         let path = first.and_then(|at| self.scenario.points_path(at.0, at.1, None).ok());
         let path = path.unwrap_or_default();
-        path.parent().unwrap_or(&path).display().to_string()
+        let folder = path.parent().unwrap_or(&path).display();
+        format!("{folder} ({})", self.scenario.name)
     }
 
     /// Places of its sweeps and of the nearest ones of another drive, where they are of one road.
@@ -72,7 +77,13 @@ impl MappedDrive {
         self.sweeps.iter().enumerate().filter_map(pair).collect()
     }
 
-    fn contradiction(&self, known: &Self, pairs: &[[usize; 2]]) -> Option<Problem> {
+    /// The offset at which most of the compared sweeps agree with another drive, metres, with the number of these and of all;
+    /// `None` if fewer than [`LEAST_ALIKE`] agree at one.
+    fn usual_offset(
+        &self,
+        known: &Self,
+        pairs: &[[usize; 2]],
+    ) -> Option<(Vector3<f64>, [usize; 2])> {
         let compared = evenly_spread(pairs, COMPARED);
         let offsets_m = compared
             .iter()
@@ -85,19 +96,24 @@ impl MappedDrive {
             alike.count()
         };
         let offset_m = offsets_m.iter().max_by_key(|offset_m| alike(offset_m))?;
-        let (alike, count) = (alike(offset_m), compared.len());
-        let [path, other] = [self, known].map(Self::folder);
+        let count = alike(offset_m);
+        (count >= LEAST_ALIKE).then_some((*offset_m, [count, compared.len()]))
+    }
+
+    fn contradiction(&self, known: &Self, offset_m: &Vector3<f64>, counts: [usize; 2]) -> Problem {
+        let [path, other] = [self, known].map(Self::name);
         let [x, y, z]: [f64; 3] = (*offset_m).into();
+        let [alike, count] = counts;
         let message = format!(
             "{path}: its poses are not in the frame of those of {other}: {alike} of {count} sweeps fit there with an offset of \
              ({x:.1}, {y:.1}, {z:.1}) m, and not without it: a map of both is double"
         );
-        (alike >= LEAST_ALIKE).then_some(Problem {
+        Problem {
             path,
             line: None,
             field: Some("world_from_lidar".to_owned()),
             message,
-        })
+        }
     }
 
     /// Planes of the sweep at a place and of those before and after it.
@@ -112,8 +128,8 @@ impl MappedDrive {
         Some(target)
     }
 
-    /// The offset at which a sweep agrees with those of another drive around it, metres, where it does not at rest; `None`
-    /// also where it agrees nowhere.
+    /// The offset at which a sweep agrees with those of another drive around it, metres: zero where it does at rest, and
+    /// `None` where it agrees nowhere.
     fn offset_m(&self, known: &Self, [place, other]: [usize; 2]) -> Option<Vector3<f64>> {
         let config = IcpConfig::default();
         let target = known.planes(other, &config)?;
@@ -130,7 +146,7 @@ impl MappedDrive {
             let by_m = fit.target_from_source.translation.vector - stated.translation.vector;
             // Mostly the first start, so that no other is tried.
             if share >= AGREED && by_m.norm() <= AGREED_M {
-                return None;
+                return Some(Vector3::zeros());
             }
             if share > best {
                 (best, best_m) = (share, by_m);

@@ -40,6 +40,9 @@ pub enum Error {
 
 /// Folders as one text.
 pub(crate) fn listed(folders: &[PathBuf]) -> String {
+    if folders.is_empty() {
+        return "the drives".to_owned();
+    }
     let folders = folders.iter().map(|folder| folder.display().to_string());
     folders.collect::<Vec<_>>().join(", ")
 }

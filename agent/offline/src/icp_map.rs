@@ -92,12 +92,12 @@ pub fn read_map(
         return Err(Error::NoSweeps(folders(), left_out.reasons()));
     }
     mapped.retain(|drive| !drive.sweeps.is_empty());
-    let (contradictions, alone) = drive_frames::contradictions(&mapped);
+    let (contradictions, unchecked) = drive_frames::contradictions(&mapped);
     left_out.add_findings(contradictions);
-    if !alone.is_empty() {
-        let alone = alone.join(", ");
+    if !unchecked.is_empty() {
+        let unchecked = unchecked.join(", ");
         output::note(format_args!(
-            "{alone}: no road in common with the drives before: it is not checked whether their poses are in one frame"
+            "{unchecked}: nothing that agrees with the drives before: it is not checked whether their poses are in one frame"
         ));
     }
     map.fit();

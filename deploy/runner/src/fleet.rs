@@ -134,7 +134,10 @@ impl Fleet {
         // An empty list stands for the agents of the protocol; an ego that is named takes part too.
         let arranged = protocol.arrange(recorded).map(|arranged| arranged.agents);
         let named = match &scene.agents[..] {
-            [] => arranged.unwrap_or_default(),
+            [] => arranged.with_context(|| {
+                let (protocol, name) = (&protocol.name, &recorded.name);
+                format!("protocol {protocol}: scenario {name} has no agent or no ego of its kinds")
+            })?,
             named => named.to_vec(),
         };
         let mut agents = recorded.agents.clone();

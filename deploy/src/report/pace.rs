@@ -91,8 +91,9 @@ fn agents(processes: &[ProcessStats], ticks: u64) -> BTreeMap<String, AgentPace>
         };
         let pace = agents.entry(cav.to_owned()).or_default();
         pace.computed += sweeps(stats);
-        // Without a tick there is no sweep.
-        pace.share = pace.computed as f64 / ticks.max(1) as f64;
+        if ticks > 0 {
+            pace.share = pace.computed as f64 / ticks as f64;
+        }
     }
     agents
 }

@@ -113,10 +113,10 @@ impl TrackReport {
         })?;
         // Results with a line of truth were taken out on the way.
         report.without_truth = without_tick + results.len();
-        let file = folder.join(metrics::FILE);
-        if file.exists() {
+        // Folders without metrics, or with those of an earlier version, are not compared.
+        if let Ok(metrics) = read_json(folder.join(metrics::FILE)) {
             let egos: BTreeSet<&String> = followed.iter().map(|one| &one.ego).collect();
-            report.conditions = conditions(&read_json(file)?, egos, report.ticks as u64);
+            report.conditions = conditions(&metrics, egos, report.ticks as u64);
         }
         let sequences: Vec<Sequence> = followed.into_iter().map(|one| one.sequence).collect();
         report.quality = TrackQuality::of(&sequences);

@@ -3,7 +3,7 @@
 use protocol::Pose;
 use re_cdr::{BigEndian, CdrReader, LittleEndian};
 
-/// Error of a message that cannot be read.
+/// Error of a message that cannot be read: names the encoding, or the field with its position or value.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{0}")]
 pub struct ReadError(pub(crate) String);

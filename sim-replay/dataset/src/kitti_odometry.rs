@@ -88,8 +88,8 @@ fn of_lines<T>(
     }
     if lines > count && last < count {
         let reason = format!(
-            "{lines} lines for {count} scans: those beyond the last scan are not used, and scans that were numbered anew \
-             have lines of others"
+            "{lines} lines for {count} scans: those beyond the last scan are not used; if the scans were numbered anew, \
+             they have the lines of others"
         );
         problems.push(ReadError::malformed(path, reason));
     }
@@ -151,7 +151,8 @@ fn times(
     if !path.is_file() {
         return Ok(None);
     }
-    let times = of_lines(&path, scans, problems, |line, text| {
+    let mut found = Vec::new();
+    let times = of_lines(&path, scans, &mut found, |line, text| {
         let [time] = kitti_text::numbers(&path, line, None, text)?;
         if time < 0.0 {
             let reason = format!("{time}, expected a time from 0");
@@ -165,6 +166,8 @@ fn times(
         let reason = "numbers of scans, expected their times";
         return Err(ReadError::malformed(&path, reason));
     }
+    // Only now: without times no scan is left out.
+    problems.append(&mut found);
     let known: Vec<f64> = times.iter().flatten().map(|(time, _)| *time).collect();
     let unit = Unit::of_file(&path, &known, problems);
     let (mut faults, mut latest) = (Faults::default(), -1.0);
@@ -420,8 +423,8 @@ mod tests {
         let poses = "1 0 0 0 0 1 0 0 0 0 1 0\n".repeat(5);
         build(dir.path(), ".", "poses.txt", &poses);
         let dataset = crate::open(dir.path()).unwrap();
-        let expected = "/poses.txt: 5 lines for 2 scans: those beyond the last scan are not used, and scans that were \
-                        numbered anew have lines of others";
+        let expected = "/poses.txt: 5 lines for 2 scans: those beyond the last scan are not used; if the scans were \
+                        numbered anew, they have the lines of others";
         assert_eq!(problems_below(dir.path(), &dataset), [expected]);
         // A gap shows that scans have their own numbers.
         let scans = dir.path().join("velodyne");

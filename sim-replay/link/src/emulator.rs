@@ -12,7 +12,7 @@ use super::loss::LossState;
 use super::packet::Packet;
 use super::queue_server::{Departure, QueueServer, Rules};
 use super::trace::Trace;
-use support::file_error::AtFile;
+use support::file_error::FileError;
 use support::nanos;
 use support::random::{SplitMix64, derive_seed};
 
@@ -84,7 +84,11 @@ impl LinkEmulator {
     /// [`LinkError`] with the file and its fault.
     pub fn open(name: &str, seed: u64) -> Result<Self, LinkError> {
         let (config, folder) = LinkConfig::open(name)?;
-        Ok(Self::new(config, &folder, seed).at(Path::new(name))?)
+        match Self::new(config, &folder, seed) {
+            Err(LinkError::Value(error)) => Err(FileError::new(Path::new(name), error).into()),
+            // Of a trace: names its own file.
+            other => other,
+        }
     }
 
     /// The emulator of a configuration; paths of traces start at `folder`. The same seed gives the same results.

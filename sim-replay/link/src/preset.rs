@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 
 use super::config::{LinkConfig, LinkError};
 use bus::config_file;
+use serde::de::IgnoredAny;
 use support::bounded_file;
 use support::file_error::{AtFile, FileError};
 
@@ -56,8 +57,8 @@ impl LinkConfig {
             );
             FileError::new(&path, problem)
         })?;
-        // As a link it would be one without limits.
-        if text.trim().is_empty() {
+        // As a link it would be one without limits, of comments alone too.
+        if serde_saphyr::from_str::<Option<IgnoredAny>>(&text).is_ok_and(|link| link.is_none()) {
             return Err(FileError::new(&path, "empty; name the preset ideal instead").into());
         }
         let config: Self = config_file::parse(&text, &path)?;
@@ -93,6 +94,7 @@ mod tests {
         };
         for (text, part) in [
             ("", "link.yaml: empty"),
+            ("# rate: 5\n", "link.yaml: empty"),
             ("latency: {constant_ms: 5ms}", "link.yaml:1: latency"),
             ("latency: {constant_ms: 5ms}", "constant_ms: 5ms"),
             ("latency: {constant_ms: -5}", "link: latency is -5"),

@@ -11,8 +11,8 @@ const SINGLE_TICK_PERIOD: u64 = 100_000_000;
 /// Gap of capture time at a jump back, nanoseconds, by which vehicles see it: more than the 60 s over which a tracked pose
 /// may be predicted. Object tracks and feature memories last for less.
 const JUMP_NANOS: u64 = 61_000_000_000;
-/// Longest jump back without a gap, periods: trackers follow one so short, and small scenes would be gaps for the most part.
-const SHORT_JUMP: u64 = 10;
+/// Longest jump back without a gap, nanoseconds: trackers follow one so short, and small scenes would be gaps for the most part.
+const SHORT_JUMP_NANOS: u64 = 1_000_000_000;
 
 /// One tick to be published.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -43,7 +43,7 @@ pub struct Position {
 ///
 /// Capture times always rise, as if the vehicles drove on: a receiver that pairs by capture time must not get one
 /// twice. After a jump back (a loop, or a seek) all times are shifted so that the next tick follows the last, by a period
-/// of the scene and, after more than [`SHORT_JUMP`] periods, the gap by which vehicles end what they track.
+/// of the scene and, after more than [`SHORT_JUMP_NANOS`], the gap by which vehicles end what they track.
 #[derive(Debug, Clone)]
 pub struct Schedule {
     captures: Arc<[u64]>,
@@ -107,7 +107,7 @@ impl Iterator for Schedule {
             && let Some(back_nanos) = last.checked_sub(back_to)
         {
             let period_nanos = median_step_nanos(&self.captures).unwrap_or(SINGLE_TICK_PERIOD);
-            gap_nanos = JUMP_NANOS * u64::from(back_nanos / period_nanos > SHORT_JUMP);
+            gap_nanos = JUMP_NANOS * u64::from(back_nanos > SHORT_JUMP_NANOS);
             let step_nanos = period_nanos.saturating_add(gap_nanos);
             self.position.shift_nanos = last.saturating_add(step_nanos).saturating_sub(recorded);
         }
@@ -174,7 +174,8 @@ mod tests {
 
     #[test]
     fn vehicles_see_a_long_jump_back_by_a_gap_that_takes_no_time() {
-        let captures: Vec<u64> = (1..=12).map(|tick| tick * 100).collect();
+        const STEP: u64 = 100_000_000;
+        let captures: Vec<u64> = (1..=12).map(|tick| tick * STEP).collect();
         let ticks = ticks(&captures);
         let mut schedule = Schedule::new(&ticks, 0, None, true);
         let gaps: Vec<u64> = { schedule.by_ref().take(36) }
@@ -184,11 +185,11 @@ mod tests {
             let is_lap = tick > 0 && tick % 12 == 0;
             assert_eq!(gap_nanos, if is_lap { JUMP_NANOS } else { 0 }, "{tick}");
         }
-        let last = 3 * 1200 + 2 * JUMP_NANOS;
-        assert_eq!(plan(&mut schedule, 1), [(0, last + 100 + JUMP_NANOS)]);
-        // Ten periods back are a short jump.
+        let last = 36 * STEP + 2 * JUMP_NANOS;
+        assert_eq!(plan(&mut schedule, 1), [(0, last + STEP + JUMP_NANOS)]);
+        // A second back is a short jump.
         let short = Schedule::new(&ticks[..11], 10, None, true);
-        assert_eq!(plan(short, 2), [(10, 1100), (0, 1200)]);
+        assert_eq!(plan(short, 2), [(10, 11 * STEP), (0, 12 * STEP)]);
     }
 
     #[test]

@@ -65,7 +65,7 @@ fn released_file(head: &Path, kind: &str, prefix: &str, trained: &str) -> Result
         // A folder may be reached by two paths.
         let released: BTreeSet<String> = stems.filter(|name| name != "encoder").collect();
         let released = match Vec::from_iter(released).join(", ") {
-            none if none.is_empty() => "no folder deploy/weights here or above".into(),
+            none if none.is_empty() => "none is released in deploy/weights here or above".into(),
             names => format!("released are {names}"),
         };
         let problem = format_args!("no such file or released {kind}; {released}");

@@ -87,7 +87,7 @@ impl LocalizedPose {
                     ..PoseSolver::default()
                 };
                 let localizer = Box::new(LightLoc::new(localizer, solver));
-                MapRegistration::of(localizer, &config.surfel_map)?
+                MapRegistration::of(localizer, &config.surfel_map, min_confidence)?
             }
             false => place_localizer(files, min_confidence, inference, |_| ())?,
         };

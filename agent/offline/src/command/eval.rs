@@ -392,7 +392,7 @@ impl Args {
     /// The localizer behind the surfel map, if there is one.
     fn registered(&self, localizer: Box<dyn Localize>) -> Result<Box<dyn Localize>, BadInput> {
         let map = surfel_map(self.surfel_map.as_deref())?;
-        MapRegistration::of(localizer, &map).map_err(BadInput::of)
+        MapRegistration::of(localizer, &map, 0.0).map_err(BadInput::of)
     }
 
     fn encoder(&self, head: &Path) -> Result<PathBuf, BadInput> {

@@ -122,7 +122,7 @@ struct LocatedPose {
     bound_m: Option<f64>,
     /// Confidence, 0..=1.
     confidence: f64,
-    /// True if it was registered to a surfel map: then it is accurate to millimetres.
+    /// True if it was registered to a surfel map: then it is accurate to millimetres, unless its confidence is low.
     registered: bool,
 }
 
@@ -169,8 +169,12 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
         ));
     }
     if remembered > 0 {
+        let hint = match args.surfel_map {
+            None => "--surfel-map measures them",
+            Some(_) => "the surfel map does not confirm these poses",
+        };
         output::note(format_args!(
-            "height, roll and pitch of {remembered} poses are those of the head's drives, not measured: --surfel-map measures them"
+            "height, roll and pitch of {remembered} poses are those of the head's drives, not measured: {hint}"
         ));
     }
     if found == 0 && lost > 0 {

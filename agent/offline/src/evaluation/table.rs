@@ -31,7 +31,7 @@ fn row(sweep: &EvaluatedSweep) -> Vec<String> {
     let before_outcome = columns().position(|column| column == "outcome");
     fields.resize(before_outcome.unwrap_or_default(), String::new());
     fields.push(outcome(&localization.estimate).to_owned());
-    // Methods without cells have no evidence; what stands for it is no measurement.
+    // Methods without cells have no evidence of this kind.
     let evidence = found.map(|(found, _)| found.evidence);
     if let Some(evidence) = evidence.filter(|evidence| evidence.cells > 0) {
         fields.extend(evidence_fields(&evidence));

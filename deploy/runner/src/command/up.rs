@@ -76,7 +76,8 @@ impl Arguments {
         };
         without_effect(&scenario).into_iter().for_each(output::note);
         let result = run_scenario(&scenario, &options)?;
-        let asked = scenario.scene.frames.filter(|_| !scenario.scene.repeat);
+        let is_whole = !scenario.scene.repeat && !result.interrupted;
+        let asked = scenario.scene.frames.filter(|_| is_whole);
         let fewer = report::fewer_frames(result.metrics.ticks as usize, asked);
         fewer.into_iter().for_each(output::note);
         if self.json {

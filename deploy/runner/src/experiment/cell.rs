@@ -64,6 +64,8 @@ impl Cell {
         let text = match bounded_file::read_text(&path, MAX_TEXT_BYTES) {
             Ok(text) => text,
             Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
+            // Bytes that are no text are no cell.
+            Err(error) if error.kind() == io::ErrorKind::InvalidData => String::new(),
             Err(error) => return Err(error).with_context(|| path.display().to_string()),
         };
         let cell = serde_json::from_str(&text)

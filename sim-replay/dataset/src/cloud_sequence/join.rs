@@ -148,8 +148,12 @@ fn by_order(count: usize, clouds: &Keys, poses: &PoseFile, have: &str) -> Result
     if let Some(joined) = by_line(clouds, rows) {
         return Ok(joined);
     }
+    let gaps = match rows == count {
+        true => " whose numbers have gaps",
+        false => "",
+    };
     Err(format!(
-        "{rows} poses for {count} clouds, or gaps between the clouds, and {have} the name, number or time of a pose: \
+        "{rows} poses for {count} clouds{gaps}, and {have} the name, number or time of a pose: \
          lines cannot be assigned; {keys}"
     ))
 }
@@ -178,14 +182,14 @@ fn is_without_gap(clouds: &Keys, times: Option<&[u64]>) -> bool {
 }
 
 /// Clouds that are numbered as the rows are: the number is that of the row. The last cloud has the last row; or clouds
-/// are numbered from 0, and at least half of the rows have one.
+/// are numbered from 0, and at least two thirds of the rows have one: with half of them every second row may be a sweep's.
 fn by_line(clouds: &Keys, rows: usize) -> Option<Join> {
     let Keys::Numbers(numbers) = clouds else {
         return None;
     };
     let (first, last) = (*numbers.first()?, *numbers.last()?);
     let is_of_rows = first <= 1 && (last + 1).checked_sub(first) == Some(rows as u64);
-    let is_beginning = first == 0 && last + 1 < rows as u64 && 2 * numbers.len() >= rows;
+    let is_beginning = first == 0 && last + 1 < rows as u64 && 3 * numbers.len() >= 2 * rows;
     let places = numbers.iter();
     let places = places.map(|number| usize::try_from(number - first).ok());
     (is_of_rows || is_beginning).then(|| Join {
@@ -276,7 +280,13 @@ mod tests {
             ),
             (&["0", "2"], vec![], 3, &[0, 2], "number of the row"),
             (&["1", "3"], vec![], 3, &[0, 2], "number of the row"),
-            (&["0", "1", "3"], vec![], 6, &[0, 1, 3], "number of the row"),
+            (
+                &["0", "1", "2", "4"],
+                vec![],
+                6,
+                &[0, 1, 2, 4],
+                "number of the row",
+            ),
             (
                 &["7.1", "7.2"],
                 times_in_tenths(&[71, 99, 72]),
@@ -323,7 +333,7 @@ mod tests {
                 &["0", "2", "3"],
                 vec![],
                 3,
-                "3 poses for 3 clouds, or gaps between the clouds",
+                "3 poses for 3 clouds whose numbers have gaps",
             ),
             (
                 &["first", "second"],

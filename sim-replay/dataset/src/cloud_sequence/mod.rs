@@ -84,8 +84,8 @@ fn open(dir: &Path, options: &OpenOptions, problems: &mut Vec<ReadError>) -> Res
     if joined.is_beginning {
         let numbers = keys.shown();
         let reason = format!(
-            "{rows} poses for clouds with {numbers}: those beyond the last cloud are not used, and clouds that were \
-             numbered anew have poses of others"
+            "{rows} poses for clouds with {numbers}: those beyond the last cloud are not used; if the clouds were \
+             numbered anew, they have the poses of others"
         );
         problems.push(ReadError::malformed(&path, reason));
     }
@@ -390,8 +390,8 @@ mod tests {
         let (joins, problems) = joined(&[10, 11], &[], 12);
         let join = "10 poses of poses.txt by number of the row, 2 without cloud";
         assert_eq!(joins, [join]);
-        let expected = "poses.txt: 12 poses for clouds with numbers 0 to 9: those beyond the last cloud are not used, and \
-                        clouds that were numbered anew have poses of others";
+        let expected = "poses.txt: 12 poses for clouds with numbers 0 to 9: those beyond the last cloud are not used; if \
+                        the clouds were numbered anew, they have the poses of others";
         assert_eq!(problems, [expected]);
         let (joins, problems) = joined(&[4, 5], &[], 12);
         assert_eq!((joins, problems.len()), (vec![join.to_owned()], 0));

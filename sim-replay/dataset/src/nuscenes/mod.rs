@@ -89,7 +89,10 @@ fn leave_copies_out(scenarios: &mut Vec<Scenario>, problems: &mut Vec<ReadError>
         let Ok(path) = scenario.points_path(0, 0, None) else {
             return true;
         };
-        let known = names.insert(path.clone(), scenario.name.clone());
+        let known = names.get(&path).cloned();
+        if known.is_none() {
+            names.insert(path.clone(), scenario.name.clone());
+        }
         problems.extend(known.iter().map(|known| {
             let again = &scenario.name;
             let reason = format!("first sweep of scene {known}: scene {again}, too, is left out");

@@ -67,7 +67,7 @@ struct Contradiction {
     best: Match,
 }
 
-/// One problem for each agent of a scenario whose sweeps contradict its poses. Reads ten sweeps of each agent at most.
+/// One problem for each agent of a scenario whose sweeps contradict its poses. Reads fifteen sweeps of each agent at most.
 /// Agents that stand, sweeps without structure and unreadable frames give none, nor do the independent frames of KITTI
 /// object.
 pub fn pose_problems(scenario: &Scenario) -> Vec<Problem> {

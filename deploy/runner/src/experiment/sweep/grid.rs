@@ -61,7 +61,7 @@ pub(in crate::experiment) fn sizes(grid: &Grid) -> Vec<(&'static str, usize)> {
     sizes
 }
 
-/// True if a method exchanges feature maps: no other message depends on their encoding.
+/// True if a method exchanges feature maps. Others run with the first encoding only, in which `none` has its own map.
 fn is_encoded(method: &Method) -> bool {
     method.exchange() == Exchange::Features
 }
