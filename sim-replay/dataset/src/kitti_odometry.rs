@@ -304,8 +304,8 @@ mod tests {
             (
                 "0\n0.1\n0.2\n",
                 2,
-                "/times.txt: 3 lines for 2 scans: those beyond the last scan are not used, and scans that were numbered \
-                 anew have lines of others",
+                "/times.txt: 3 lines for 2 scans: those beyond the last scan are not used; if the scans were numbered \
+                 anew, they have the lines of others",
             ),
         ] {
             fs::write(dir.path().join("times.txt"), times).unwrap();
