@@ -43,7 +43,7 @@ pub struct Position {
 ///
 /// Capture times always rise, as if the vehicles drove on: a receiver that pairs by capture time must not get one
 /// twice. After a jump back (a loop, or a seek) all times are shifted so that the next tick follows the last, by a period
-/// of the scene and, after more than [`SHORT_JUMP_NANOS`], the gap by which vehicles end what they track.
+/// of the scene and, after more than a second, the gap by which vehicles end what they track.
 #[derive(Debug, Clone)]
 pub struct Schedule {
     captures: Arc<[u64]>,
