@@ -25,7 +25,7 @@ pub fn position_bound_m(found: &FoundPose) -> Option<f64> {
     scale.bound_m(found.sigma, &unscaled_covariance(found), found.start_std_m)
 }
 
-/// The covariance without the fitted factors. Residuals determine its shape; its size is that of [`unscaled_std`], the
+/// The covariance without the fitted factors. Residuals determine its shape; its size is that of the unscaled deviations, the
 /// error which the fitted confidence stands for. That of a registered pose is its own.
 pub fn unscaled_covariance(found: &FoundPose) -> [[f64; 6]; 6] {
     if found.is_registered {

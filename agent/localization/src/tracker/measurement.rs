@@ -29,7 +29,7 @@ pub struct PoseMeasurement {
 }
 
 impl PoseMeasurement {
-    /// Measurement from an estimated pose, with its [`unscaled_std`] times the factors that were fitted.
+    /// Measurement from an estimated pose, with its unscaled deviations times the factors that were fitted.
     pub fn new(capture_nanos: u64, found: &FoundPose) -> Self {
         let [position_std_m, yaw_std_rad] = unscaled_std(found);
         let scale = found.covariance_scale.unwrap_or(CovarianceScale::NONE);
