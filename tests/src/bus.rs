@@ -8,7 +8,6 @@ use bus::{
     self, Bus, BusConfig, BusOptions, Endpoint, Event, Identity, Inbox, InboxLimits,
     bounded_queue::Pop,
 };
-use dataset::LoadOptions;
 use ego_fuser::config::EgoSettings;
 use ego_fuser::node::NodeOptions;
 use protocol::{CavId, ProcessId, RunId, Stream, Topic};
@@ -33,19 +32,9 @@ pub fn ego_options(deadline: Duration) -> NodeOptions {
 #[must_use]
 pub fn stream_options() -> StreamOptions {
     StreamOptions {
-        agents: Vec::new(),
-        rate: 1.0,
-        repeats: false,
-        seek: 0,
-        frames: None,
-        load: LoadOptions::default(),
-        await_agents: true,
-        expect: Vec::new(),
         ready_timeout: TIMEOUT,
-        lockstep: Vec::new(),
         answer_timeout: TIMEOUT,
-        link: None,
-        checkpoint: None,
+        ..StreamOptions::default()
     }
 }
 

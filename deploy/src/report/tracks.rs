@@ -55,7 +55,7 @@ pub struct TrackReport {
     /// The metrics.
     #[serde(flatten)]
     pub quality: TrackQuality,
-    /// What has to be equal in runs that are compared; `null` without `metrics.json`.
+    /// Conditions of the run, which are equal in runs that can be compared; `null` without `metrics.json`.
     #[serde(skip)]
     conditions: Value,
 }

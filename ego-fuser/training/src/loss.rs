@@ -26,7 +26,7 @@ pub const SCORE_WEIGHT: f64 = 1.0;
 /// Weight of the regression term.
 pub const BOX_WEIGHT: f64 = 2.0;
 
-/// What of the loss is set for a training.
+/// Settings of the loss of a training.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct LossConfig {
     /// Weight of the alignment term: the difference of a fusion's own pose corrections from the errors that were added.

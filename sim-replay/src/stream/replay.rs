@@ -64,6 +64,26 @@ pub struct StreamOptions {
     pub checkpoint: Option<PathBuf>,
 }
 
+impl Default for StreamOptions {
+    fn default() -> Self {
+        Self {
+            agents: Vec::new(),
+            rate: 1.0,
+            repeats: false,
+            seek: 0,
+            frames: None,
+            load: LoadOptions::default(),
+            await_agents: true,
+            expect: Vec::new(),
+            ready_timeout: Duration::from_secs(60),
+            lockstep: Vec::new(),
+            answer_timeout: Duration::from_secs(60),
+            link: None,
+            checkpoint: None,
+        }
+    }
+}
+
 impl StreamOptions {
     /// The options that give the order of ticks, as text.
     fn plan(&self) -> String {
@@ -476,21 +496,7 @@ mod tests {
 
     #[test]
     fn the_options_that_give_the_order_of_ticks_are_in_the_plan() {
-        let whole = StreamOptions {
-            agents: Vec::new(),
-            rate: 1.0,
-            repeats: false,
-            seek: 0,
-            frames: None,
-            load: LoadOptions::default(),
-            await_agents: true,
-            expect: Vec::new(),
-            ready_timeout: Duration::ZERO,
-            lockstep: Vec::new(),
-            answer_timeout: Duration::ZERO,
-            link: None,
-            checkpoint: None,
-        };
+        let whole = StreamOptions::default();
         let part = StreamOptions {
             seek: 5,
             frames: Some(40),
