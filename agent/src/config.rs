@@ -482,7 +482,7 @@ mod tests {
     #[test]
     fn the_configuration_of_a_robot_is_one_of_poses_only() {
         let file = concat!(env!("CARGO_MANIFEST_DIR"), "/../deploy/ros2/agent.yaml");
-        let config: AgentConfig = bus::config_file::read(file.as_ref()).unwrap();
+        let config: AgentConfig = support::config_file::read(file.as_ref()).unwrap();
         config.validate().unwrap();
         assert!(config.gives_poses_only());
         assert_eq!(config.settings.pose.name(), "tracked");

@@ -3,9 +3,9 @@
 use std::fmt;
 use std::path::Path;
 
-use bus::config_file;
 use serde::Serialize;
 use serde_json::{Value, json};
+use support::config_file;
 use support::file_error::FileError;
 use terminal::text_table::{Side, TextTable, number};
 

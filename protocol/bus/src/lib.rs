@@ -35,7 +35,6 @@ mod batch_scheduling;
 pub mod bounded_queue;
 mod bus;
 mod clock_offset;
-pub mod config_file;
 mod credentials;
 mod delivery_gaps;
 mod egress;
@@ -66,7 +65,6 @@ mod shared_pool;
 pub mod shutdown;
 mod status_publisher;
 mod subscriber;
-mod unknown_field;
 mod watchdog;
 pub mod web;
 

@@ -14,8 +14,6 @@ use serde_json::{Value, json};
 use support::cli::BadInput;
 use support::file_error::FileError;
 
-use super::config_file;
-
 /// Configuration of one process.
 pub trait ProcessConfig: Args + Serialize + DeserializeOwned {
     /// Fields without a default: `run`, or `models.weights` in a section. The option of each has the last part as its
@@ -76,7 +74,7 @@ impl<C: ProcessConfig> FromArgMatches for Configured<C> {
         let file = matches.get_one::<PathBuf>("config").cloned();
         // Step 1: the file, or required options over the defaults.
         let mut config: C = match &file {
-            Some(path) => config_file::read(path).map_err(refused)?,
+            Some(path) => support::config_file::read(path).map_err(refused)?,
             None => minimal(|option| text_of(matches, option)).map_err(refused)?,
         };
         // Step 2: the options that are given override it, the others keep its values.

@@ -2,8 +2,8 @@
 //!
 //! - [`command_line`]: parsing, verbosity; [`cli`]: errors and exit codes; [`output`]: standard output and error;
 //!   [`sibling_program`]: subcommands that another program executes; [`shared_files`]: files that come with the programs.
-//! - [`bounded_file`], [`atomic_file`], [`csv_file`], [`file_digests`]: reads with a limit on their size, atomic writes,
-//!   CSV, SHA-256 of whole files; errors name the file ([`file_error`]).
+//! - [`bounded_file`], [`atomic_file`], [`config_file`], [`csv_file`], [`file_digests`]: reads with a limit on their size,
+//!   atomic writes, YAML, CSV, SHA-256 of whole files; errors name the file ([`file_error`]).
 //! - [`statistics`], [`stage_times`], [`nanos`]: quantiles and correlations, the stopwatch, durations in nanoseconds;
 //!   [`sync`]: locks.
 //! - [`provenance`]: the command, programs and digests that a result was made from.
@@ -30,6 +30,7 @@ pub mod atomic_file;
 pub mod bounded_file;
 pub mod cli;
 pub mod command_line;
+pub mod config_file;
 pub mod csv_file;
 pub mod file_digests;
 pub mod file_error;
@@ -47,3 +48,4 @@ pub mod stage_times;
 pub mod statistics;
 pub mod sweep_log;
 pub mod sync;
+mod unknown_field;

@@ -4,9 +4,9 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use super::config::{LinkConfig, LinkError};
-use bus::config_file;
 use serde::de::IgnoredAny;
 use support::bounded_file;
+use support::config_file;
 use support::file_error::{AtFile, FileError};
 
 /// Every preset with a one-line description.

@@ -3,8 +3,8 @@
 use std::path::Path;
 
 use anyhow::{Result, anyhow};
-use bus::config_file;
 use link::LinkConfig;
+use support::config_file;
 use support::file_error::FileError;
 
 use super::check;

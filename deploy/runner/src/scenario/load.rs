@@ -3,8 +3,8 @@
 use std::path::{Path, PathBuf};
 
 use agent::config::AgentSettings;
-use bus::config_file;
 use link::LinkConfig;
+use support::config_file;
 use support::file_error::{AtFile, FileError, Result};
 
 use super::{FieldOverride, Scenario};

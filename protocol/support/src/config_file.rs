@@ -3,12 +3,11 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
+use crate::bounded_file;
+use crate::file_error::{AtFile, FileError};
+use crate::unknown_field;
 use protocol::text::excerpt;
 use serde::de::{DeserializeOwned, IgnoredAny};
-use support::bounded_file;
-use support::file_error::{AtFile, FileError};
-
-use super::unknown_field;
 
 /// Maximum size of a file, bytes.
 const MAX_BYTES: u64 = 1 << 20;
