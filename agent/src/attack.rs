@@ -37,7 +37,7 @@ pub enum Falsification {
     /// The perception is noise with the mean and standard deviation of the true one.
     Noise,
     /// The perception is a copy of another vehicle's messages, or of its own first frame if none is received, under its
-    /// own pose.
+    /// own pose. Refused where a vehicle is a process of its own (live, `stepped.processes`): it gets no such messages.
     Copied,
     /// Ten vehicles that do not exist are added to the true perception.
     Invented,

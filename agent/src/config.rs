@@ -286,18 +286,24 @@ impl AgentSettings {
         self.codec.validate()
     }
 
-    /// Checks that an attack has something to falsify among the streams that are sent.
+    /// Checks that an attack has something to falsify among the streams that are sent, and something to copy: the
+    /// messages of other vehicles, which none in a `process` of its own gets.
     ///
     /// # Errors
     /// [`FieldError`] when it has nothing.
-    pub fn check_attack(&self, sent: &[Stream]) -> Result<(), FieldError> {
-        match self.falsification {
-            Some(attack @ Falsification::FalseVelocity) if !sent.contains(&Stream::Boxes) => {
-                let rule = "needs boxes, which state velocities: the vehicle sends none";
-                Err(FieldError::new("agents.falsification", attack.name(), rule))
-            }
-            _ => Ok(()),
-        }
+    pub fn check_attack(&self, sent: &[Stream], process: bool) -> Result<(), FieldError> {
+        let (attack, rule) = match self.falsification {
+            Some(attack @ Falsification::FalseVelocity) if !sent.contains(&Stream::Boxes) => (
+                attack,
+                "needs boxes, which state velocities: the vehicle sends none",
+            ),
+            Some(attack @ Falsification::Copied) if process => (
+                attack,
+                "must be another: it copies vehicles of the same process (clock: stepped without processes)",
+            ),
+            _ => return Ok(()),
+        };
+        Err(FieldError::new("agents.falsification", attack.name(), rule))
     }
 
     /// Checks that a feature map of this network is within the byte limits at least without cells.
@@ -384,7 +390,7 @@ impl ProcessConfig for AgentConfig {
         self.settings.validate()?;
         // Against the streams as they are sent: boxes may stand in for maps.
         self.settings
-            .check_attack(&self.options().of_loop.publish)?;
+            .check_attack(&self.options().of_loop.publish, true)?;
         self.bus.validate()
     }
 }

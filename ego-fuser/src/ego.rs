@@ -333,9 +333,7 @@ impl Ego {
         let no_pose = Some(DropReason::NoPose);
         let world_from_ego = own.pose.world_from_cav().ok_or(no_pose)?;
         let world_from_cav = view.pose.world_from_cav().ok_or(no_pose)?;
-        let [dx, dy] = [0, 1]
-            .map(|axis| world_from_cav.translation_m[axis] - world_from_ego.translation_m[axis]);
-        if dx.hypot(dy) > self.comm_range_m {
+        if world_from_ego.planar_distance_m(world_from_cav) > self.comm_range_m {
             return Err(Some(DropReason::OutOfRange));
         }
         let fits = match (&own.content, &view.content) {

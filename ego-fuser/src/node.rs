@@ -9,8 +9,8 @@ use std::time::{Duration, Instant};
 use bus::bounded_queue::Pop;
 use bus::shutdown::Stop;
 use bus::{
-    Arrival, Bus, BusError, Event, Inbox, InboxLimits, LINK_TRANSIT_S, NETWORK_TRANSIT_S,
-    Publisher, PublisherOptions, Subscription, unix_nanos,
+    Arrival, Bus, BusError, Event, Inbox, InboxLimits, Publisher, PublisherOptions, Subscription,
+    longest_transit_s, unix_nanos,
 };
 use protocol::message::{Descriptor, FrameReport, StageTiming};
 use protocol::{
@@ -240,15 +240,21 @@ impl<'a> EgoNode<'a> {
                     self.handle(change);
                 }
             }
-            match self.inbox.take(Some(self.next_moment())) {
+            let taken = self.inbox.take(Some(self.next_moment()));
+            let arrived_nanos = match &taken {
+                Pop::Item(_, Event::Message(arrival)) => Some(self.clock.nanos(arrival.at)),
+                _ => None,
+            };
+            match taken {
                 Pop::Item(_, Event::Message(arrival)) if self.is_of_departed(&arrival) => {}
                 Pop::Item(_, Event::Message(arrival)) => self.admit(&arrival),
                 Pop::Item(topic, Event::End { .. }) => self.end(&topic),
                 Pop::TimedOut => {}
                 Pop::Closed => return Ok(()),
             }
-            // After each message: frames that wait in the loop would be one more queue behind the inbox.
-            self.handle(Input::Wake);
+            if is_time(arrived_nanos, self.ego_loop.wakes_nanos()) {
+                self.handle(Input::Wake);
+            }
             // What the ego waits for is reported with the counters of the process.
             let problems = self.ego_loop.waits.problems(self.clock.now_nanos());
             let problems = problems.into_iter();
@@ -267,7 +273,9 @@ impl<'a> EgoNode<'a> {
             return self.admit_descriptor(cav, arrival);
         }
         let (stats, began) = (self.bus.stats(), Instant::now());
-        let transport = stats.transport(arrival, self.longest_transit_s());
+        // The own agent's message takes no link, and has one clock with the ego.
+        let longest_s = longest_transit_s(self.options.over_link);
+        let transport = stats.transport(arrival, longest_s);
         let reception = Reception {
             cav: cav.clone(),
             arrived_nanos: self.clock.nanos(arrival.at),
@@ -317,7 +325,7 @@ impl<'a> EgoNode<'a> {
             return;
         };
         let stats = self.bus.stats();
-        let offset_s = stats.system_clock_offset_s(cav, self.longest_transit_s());
+        let offset_s = stats.system_clock_offset_s(cav, longest_transit_s(self.options.over_link));
         let offset_nanos = (offset_s * 1e9) as i64;
         let newest_nanos = arrival.header.stamp.capture_nanos;
         // Arrivals are on the clock of the agent. Minus its lead they are on that of the ego.
@@ -327,14 +335,6 @@ impl<'a> EgoNode<'a> {
         });
         self.handle(Input::Sweeps(cav.clone(), sweeps.collect()));
         self.handle(Input::Model(cav.clone(), descriptor));
-    }
-
-    /// Longest transit time of a message, seconds; the own agent's, which takes no link, has one clock with the ego.
-    fn longest_transit_s(&self) -> f64 {
-        match self.options.over_link {
-            true => LINK_TRANSIT_S,
-            false => NETWORK_TRANSIT_S,
-        }
     }
 
     fn end(&mut self, topic: &Topic) {
@@ -425,5 +425,25 @@ impl<'a> EgoNode<'a> {
         let look_round = Instant::now() + LOOK_ROUND;
         let wakes = self.ego_loop.wakes_nanos();
         wakes.map_or(look_round, |wakes| self.clock.moment(wakes).min(look_round))
+    }
+}
+
+/// True if the loop is woken: not after a message that arrived before its deadline, as more may have, and all of these are
+/// taken before the frame is decided. A later one ends that, so that no stream of messages delays the frame for ever.
+fn is_time(arrived_nanos: Option<u64>, wakes_nanos: Option<u64>) -> bool {
+    arrived_nanos.is_none_or(|arrived| wakes_nanos.is_none_or(|wakes| arrived >= wakes))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn at_its_deadline_a_frame_is_decided_when_all_messages_are_taken() {
+        let deadline = Some(7);
+        assert!(!is_time(Some(6), deadline), "more may have arrived");
+        assert!(is_time(None, deadline) && is_time(Some(7), deadline));
+        assert!(is_time(Some(6), Some(0)), "the frame waits for nothing");
+        assert!(is_time(Some(6), None), "the pace is repeated");
     }
 }

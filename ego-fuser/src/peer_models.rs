@@ -52,9 +52,9 @@ impl PeerModels {
         (before.as_ref() != Some(&other)).then_some(other)
     }
 
-    /// True if an agent's descriptor names another network.
-    pub(crate) fn is_other(&self, cav: &CavId) -> bool {
-        self.others.contains_key(cav)
+    /// What differs, with both values, if an agent's descriptor names another network.
+    pub(crate) fn other(&self, cav: &CavId) -> Option<&String> {
+        self.others.get(cav)
     }
 
     /// Removes an agent that has left.
@@ -110,7 +110,7 @@ mod tests {
             sweeps: vec![],
         };
         assert_eq!(models.update(&cav, &same), None);
-        assert!(!models.is_other(&cav));
+        assert_eq!(models.other(&cav), None);
 
         let hash = Descriptor {
             model_hash: ModelHash([8; 32]),
@@ -123,7 +123,7 @@ mod tests {
                 && text.contains(&"08".repeat(32))
         );
         assert_eq!(models.update(&cav, &hash), None, "reported once");
-        assert!(models.is_other(&cav));
+        assert_eq!(models.other(&cav), Some(&text));
         let narrow = Descriptor {
             channels: 32,
             ..hash
@@ -139,9 +139,9 @@ mod tests {
         assert!(models.update(&cav, &wide).unwrap().starts_with("grid is "));
 
         assert_eq!(models.update(&cav, &same), None);
-        assert!(!models.is_other(&cav));
+        assert_eq!(models.other(&cav), None);
         models.update(&cav, &wide);
         models.forget(&cav);
-        assert!(!models.is_other(&cav));
+        assert_eq!(models.other(&cav), None);
     }
 }

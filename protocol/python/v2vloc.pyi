@@ -271,11 +271,12 @@ class Frame:
         merged by id, in the frame of the ego's LiDAR. The boxes are read-only.
 
         :param ego: takes part in any case; default: :attr:`ego`, and that of ``protocol`` in a data set.
-        :param protocol: evaluation protocol, for example ``opv2v``; default: the one of the data set's layout, or that by
-            which a recorded run was scored. Of live runs, and of recordings outside of a run folder, ``opv2v``.
+        :param protocol: evaluation protocol, for example ``opv2v``; default: the one of :func:`read`, of the data set's layout, or
+            that by which a recorded run was scored. Of live runs, and of recordings outside of a run folder, ``opv2v``.
         :param area_m: x, y, z low, then x, y, z high of the detector in the LiDAR frame: the range of the protocol ends
             there.
-        :raises Error: without a true pose of the ego, or if ``area_m`` is no range.
+        :raises Error: without a true pose of the ego, if ``area_m`` is no range, or if the ego of ``protocol`` has other frames
+            than the data set was read with.
         """
 
 Payload = Union[NDArray[np.float32], PoseEstimate, Bev, Detections, Camera, Agent, dict[str, Any], str]
@@ -310,8 +311,8 @@ class Message:
         ``boxes``, ``detections``: :class:`Detections`; ``camera``: :class:`Camera`; ``points``: :class:`Agent`;
         ``truth``: a dictionary with ``tick`` and ``agents``; others: their fields as a dictionary."""
 
-class DataSet(Sequence[Frame]):
-    """Frames of a data set or recording: iterable and indexable. It can be pickled, for worker processes of a loader."""
+class DataSet:
+    """Frames of a data set or recording: iterable and indexable by numbers. It can be pickled, for worker processes of a loader."""
 
     @property
     def path(self) -> PathLike[str]: ...
@@ -327,7 +328,7 @@ class DataSet(Sequence[Frame]):
     def problems(self) -> list[str]:
         """Files that cannot be read, each with its reason. Those of a frame are in :attr:`Frame.problems`."""
     def __len__(self) -> int: ...
-    def __getitem__(self, index: int) -> Frame: ...  # type: ignore[override]
+    def __getitem__(self, index: int) -> Frame: ...
     def __iter__(self) -> Iterator[Frame]: ...
 
 class Listener(Iterator[Frame]):
@@ -355,7 +356,11 @@ class Listener(Iterator[Frame]):
     ) -> None: ...
 
 def read(
-    path: Union[str, PathLike[str]], points: bool = True, radar: bool = False, cameras: bool = False
+    path: Union[str, PathLike[str]],
+    points: bool = True,
+    radar: bool = False,
+    cameras: bool = False,
+    protocol: Optional[str] = None,
 ) -> DataSet:
     """Opens a data set, split or scenario in any layout that v2vloc reads, a recording (``.mcap``), or the folder of a
     recorded run.
@@ -363,6 +368,8 @@ def read(
     :param points: read LiDAR sweeps.
     :param radar: read radar sweeps.
     :param cameras: read images.
+    :param protocol: evaluation protocol: the agents of a data set that take part by it, at the frames of its ego. Default:
+        all agents, and the protocol of the layout or of the recorded run.
     :raises Error: if it cannot be opened. A frame that cannot be read in part has the rest.
     """
 
@@ -410,8 +417,9 @@ def average_precision(
     detections on objects of other classes count neither way.
 
     :param detections: of each frame: :class:`Detections`, or boxes ``[N, 7]`` and scores ``[N]``.
+        No size is negative.
     :param truth: of each frame: :class:`Objects`, or boxes ``[M, 7]`` in the same frame of reference, which all count.
-    :param iou: overlap from which a detection counts; several give a dictionary.
+    :param iou: overlap from which a detection counts; a list or array, also of one, gives a dictionary.
     :param ordering: ``global``: by score over all frames; ``frame``: frame after frame (the default of OpenCOOD).
     :return: 0 to 1; ``None`` where no object counts, also without frames.
     :raises Error: with the frame whose shape or value is wrong.

@@ -7,7 +7,7 @@ named! {
     pub enum DropReason {
         /// Lost on the emulated link.
         LinkLoss = "link_loss",
-        /// The queue of the emulated link was full.
+        /// The queue of the emulated link was full, or kept the newest message only.
         LinkQueue = "link_queue",
         /// Replaced by a newer message before it was used.
         Superseded = "superseded",
@@ -53,16 +53,33 @@ named! {
 }
 
 impl DropReason {
-    /// True if data were lost that should have been used: not by the emulated link, and not because they were rightly
-    /// rejected.
+    /// True if data were lost that should have been used: not by the emulated link, not because they were rightly rejected,
+    /// and not a copy of what had arrived.
     pub fn is_loss(self) -> bool {
         !matches!(
             self,
             Self::LinkLoss
                 | Self::LinkQueue
+                | Self::Duplicate
                 | Self::OutOfRange
                 | Self::Misbehaviour
                 | Self::Unneeded
         )
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_the_emulated_link_does_is_no_loss() {
+        let of_link = [
+            DropReason::LinkLoss,
+            DropReason::LinkQueue,
+            DropReason::Duplicate,
+        ];
+        assert!(!of_link.into_iter().any(DropReason::is_loss));
+        assert!(DropReason::Superseded.is_loss() && DropReason::Stale.is_loss());
     }
 }

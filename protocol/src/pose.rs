@@ -118,6 +118,12 @@ impl Pose {
         }
     }
 
+    /// Distance from another pose in the plane of the world, metres: what a communication range is compared with.
+    pub fn planar_distance_m(&self, other: &Self) -> f64 {
+        let ([x, y, _], [other_x, other_y, _]) = (self.translation_m, other.translation_m);
+        (other_x - x).hypot(other_y - y)
+    }
+
     /// `target_from_source` from two poses in one world: `self` is `world_from_target`.
     pub fn from_world(&self, world_from_source: &Self) -> Self {
         self.isometry()
@@ -209,6 +215,16 @@ mod tests {
             let identity = pose.from_world(&pose).isometry();
             prop_assert!(identity.translation.vector.norm() < 1e-8 && identity.rotation.angle() < 1e-7);
         }
+    }
+
+    #[test]
+    fn a_range_is_measured_in_the_plane_of_the_world() {
+        let at = |translation_m| Pose {
+            translation_m,
+            ..Pose::IDENTITY
+        };
+        let distance_m = at([1.0, 2.0, 0.0]).planar_distance_m(&at([4.0, 6.0, 75.0]));
+        assert!((distance_m - 5.0).abs() < 1e-12, "{distance_m}");
     }
 
     proptest! {

@@ -87,9 +87,10 @@ pub fn run(
     let ages = node.kept.values().map(|arrival| arrival.at.elapsed());
     let longest = ages.max().unwrap_or_default();
     report.longest_ms = u64::try_from(longest.as_millis()).unwrap_or(u64::MAX);
-    // Every message is accounted for: what the end of the run cuts off counts as stale.
-    for arrival in node.kept.values() {
-        bus.stats().dropped(&arrival.topic, DropReason::Stale);
+    // Messages that would have arrived after the end are in flight, those of a link that is stuck are lost.
+    let kept = node.kept.values();
+    for stuck in kept.filter(|arrival| arrival.at.elapsed() > Duration::from_millis(STUCK_MS)) {
+        bus.stats().dropped(&stuck.topic, DropReason::Stale);
     }
     let vehicles = node.vehicles.into_values();
     vehicles
@@ -311,13 +312,9 @@ impl<'a> LinkNode<'a> {
         self.next_id += 1;
     }
 
-    /// Distance between a sender and the ego, metres; 0 while either position is unknown.
+    /// Distance between a sender and the ego, metres.
     fn distance_m(&self, from: &CavId) -> f64 {
-        let [from, to] = [from, &self.options.ego].map(|cav| self.vehicles.get(cav)?.position_m);
-        match (from, to) {
-            (Some(from), Some(to)) => (from[0] - to[0]).hypot(from[1] - to[1]),
-            _ => 0.0,
-        }
+        Packet::distance_m([from, &self.options.ego].map(|cav| self.vehicles.get(cav)?.position_m))
     }
 
     /// Forwards the messages that have arrived by now.

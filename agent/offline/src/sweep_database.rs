@@ -59,16 +59,17 @@ pub fn open_drives(folder: &Path, left_out: &mut LeftOut) -> Result<Dataset> {
     Ok(drives)
 }
 
-/// The statement that two of some folders have the same scenario; `None` if each scenario is there once.
+/// The statement that two of some folders, or one that is given twice, have the same scenario; `None` if none have.
 ///
 /// # Errors
 /// [`Error`] names the folder that cannot be opened.
 pub fn repeated<'a>(folders: impl IntoIterator<Item = &'a PathBuf>) -> Result<Option<String>> {
     let mut folder_of = HashMap::new();
-    for folder in folders {
+    for (place, folder) in folders.into_iter().enumerate() {
         for scenario in dataset::open(folder)?.scenarios {
-            let other = first_sweep(&scenario).and_then(|first| folder_of.insert(first, folder));
-            if let Some(other) = other {
+            let first = first_sweep(&scenario);
+            let other = first.and_then(|first| folder_of.insert(first, (place, folder)));
+            if let Some((_, other)) = other.filter(|(other, _)| *other != place) {
                 let (other, folder, name) = (other.display(), folder.display(), scenario.name);
                 let reason =
                     format!("{other} and {folder} both have the sweeps of scenario {name}");

@@ -321,6 +321,9 @@ impl DetectorConfig {
         let is_even = self.y_axis == YAxis::Left || (range[1] + range[4]).abs() <= 1e-9;
         let rule = "must be as wide to the left as to the right if y_axis is right";
         require(is_even, "lidar_range_m", range, rule)?;
+        let own @ [x_low, y_low, x_high, y_high] = self.own_body_m.unwrap_or(OWN_BODY_M);
+        let is_box = x_low < x_high && y_low < y_high;
+        require(is_box, "own_body_m", own, "must be lower below upper")?;
         let [x, y, z] = self.pillar_grid();
         within("pillar layers along z", z, 1, 1)?;
         // A wrong range has huge counts, whose product must not overflow.
@@ -496,6 +499,21 @@ mod tests {
             ..DetectorConfig::lean()
         };
         assert_refused(&ratio, "number of parameters", "256000000");
+    }
+
+    #[test]
+    fn an_own_body_whose_edges_are_swapped_is_refused() {
+        let [x_low, y_low, x_high, y_high] = OWN_BODY_M;
+        let swapped = DetectorConfig {
+            own_body_m: Some([x_high, y_low, x_low, y_high]),
+            ..DetectorConfig::lean()
+        };
+        assert_refused(&swapped, "own_body_m", "[2.95, -1.1, -1.95, 1.1]");
+        let none = DetectorConfig {
+            own_body_m: None,
+            ..DetectorConfig::lean()
+        };
+        none.validate().unwrap();
     }
 
     #[test]

@@ -4,7 +4,7 @@ use crate::agent::Agent;
 use crate::config::AgentConfig;
 use crate::node;
 use anyhow::Context;
-use bus::{Configured, STOP_LIMIT, log_to_stderr};
+use bus::{Configured, log_to_stderr};
 use perception::detector::Detector;
 use protocol::Role;
 use support::output;
@@ -37,9 +37,7 @@ pub(crate) fn run(args: Args) -> anyhow::Result<Outcome> {
         tracing::info!(%cav, weights = %config.models.weights.display(), "ready");
     }
     let report = node::run(&bus, agent, &config.options(), &stop)?;
-    if let Err(overdue) = bus.leave(STOP_LIMIT) {
-        tracing::warn!("{overdue}");
-    }
+    bus.leave_at_end();
     if args.json {
         output::line(serde_json::to_string(&report)?)?;
     } else {

@@ -5,12 +5,8 @@ use deploy::score::metrics::Metrics;
 use ego_fuser_offline::evaluation::{EvaluatedFrame, Evaluator};
 use protocol::CavId;
 
-/// Scores a frame; if compute times are emulated, its stamp is the time of publication. A frame without the ego's true
-/// pose is left out.
+/// Scores a frame; if it `is_timed`, its stamp is the time of publication.
 pub(crate) fn judge(scores: &mut FrameScores, frame: EvaluatedFrame, is_timed: bool) {
-    if !frame.has_true_pose() {
-        return;
-    }
     let (stamp, frames) = (frame.stamp, frame.frames);
     let cavs = frames.iter().map(|frame| frame.cav.clone());
     let poses: Vec<_> = cavs.zip(frame.poses).collect();
@@ -40,11 +36,12 @@ pub(crate) fn metrics(
 ) -> Metrics {
     let names = [evaluator.ego.method().name(), pose_source];
     let (ledger, sent_bytes) = (&evaluator.ledger, Some(evaluator.sent_bytes));
-    Metrics {
-        left_out: evaluator.left_out.clone(),
+    let mut metrics = Metrics {
         protocol: evaluator.protocol(),
         ..Metrics::of(scores, clock, names, seconds, ledger, sent_bytes)
-    }
+    };
+    metrics.left_out.merge(&evaluator.left_out);
+    metrics
 }
 
 #[cfg(test)]
@@ -55,6 +52,7 @@ mod tests {
     use protocol::{Detections, Handedness, Pose, Stamp};
 
     use super::*;
+    use crate::frame_lines::FrameLines;
 
     const RULE: GroundTruthRule = GroundTruthRule::OPV2V;
 
@@ -98,6 +96,27 @@ mod tests {
     }
 
     #[test]
+    fn a_frame_without_the_true_pose_of_the_ego_has_a_result_and_no_truth_in_the_files() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut lines = FrameLines::create(folder.path()).unwrap();
+        for (tick, pose) in [(0, Some(Pose::IDENTITY)), (1, None)] {
+            assert!(lines.add(Some("s"), &frame(tick, pose)).is_continue());
+        }
+        let failed = EvaluatedFrame {
+            failure: Some("no point".into()),
+            ..frame(2, None)
+        };
+        assert!(lines.add(Some("s"), &failed).is_continue());
+        assert_eq!(lines.scenarios, ["s"; 2]);
+        lines.finish().unwrap();
+        let ticks = ["detections.jsonl", "truth.jsonl"].map(|name| {
+            let text = std::fs::read_to_string(folder.path().join(name)).unwrap();
+            text.lines().count()
+        });
+        assert_eq!(ticks, [2, 1]);
+    }
+
+    #[test]
     fn a_frame_without_the_true_pose_of_the_ego_counts_in_no_score() {
         let mut scores = FrameScores::new(ego(), RULE, 1);
         for (tick, pose) in [Some(Pose::IDENTITY), None, Some(Pose::IDENTITY)]
@@ -107,6 +126,7 @@ mod tests {
             judge(&mut scores, frame(tick, pose), true);
         }
         let ticks: Vec<u64> = scores.records().iter().map(|record| record.tick).collect();
-        assert_eq!((ticks, scores.ticks()), (vec![0, 2], (2, 2)));
+        assert_eq!((ticks, scores.ticks()), (vec![0, 1, 2], (2, 2)));
+        assert_eq!(scores.unplaced(), [1]);
     }
 }

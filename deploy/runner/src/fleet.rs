@@ -4,13 +4,12 @@ mod processes;
 mod routes;
 mod setup;
 
-use std::io;
 use std::path::{Path, PathBuf};
 
 use agent::config::{AgentSettings, FleetPlace};
 use anyhow::{Context, Result, anyhow, bail, ensure};
 use dataset::evaluation_protocol::EvaluationProtocol;
-use dataset::{self, OpenOptions, Problem, Scenario as Recorded, findings};
+use dataset::{self, LeftOut, OpenOptions, Problem, Scenario as Recorded, findings};
 use deploy::operate::keys::{KeyFileError, principals_of};
 use deploy::operate::run_folder::RunFolder;
 use deploy::operate::security::RunKeys;
@@ -52,8 +51,10 @@ pub struct Fleet {
     pub detector: DetectorConfig,
     /// Evaluation protocol of the run.
     pub protocol: EvaluationProtocol,
-    /// Findings about the recorded scenario.
+    /// Findings about what is played.
     pub findings: Vec<Problem>,
+    /// The same, and the files of the data set that cannot be used.
+    pub left_out: LeftOut,
 }
 
 /// Loads what the processes of a scenario load, so that faulty weights and links are refused before any starts; returns
@@ -132,9 +133,9 @@ impl Fleet {
             bail!("{field} names vehicle {cav}, but scenario {name} has {found:?}");
         }
         // An empty list stands for the agents of the protocol; an ego that is named takes part too.
-        let arranged = protocol.arrange(recorded).map(|arranged| arranged.agents);
+        let arranged = protocol.arrange(recorded);
         let named = match &scene.agents[..] {
-            [] => arranged.with_context(|| {
+            [] => arranged.clone().map(|of| of.agents).with_context(|| {
                 let (protocol, name) = (&protocol.name, &recorded.name);
                 format!("protocol {protocol}: scenario {name} has no agent or no ego of its kinds")
             })?,
@@ -162,8 +163,15 @@ impl Fleet {
         } else {
             Some(scene.frames.map_or(left, |frames| frames.min(left)))
         };
+        // As in an evaluation: of the agents of the protocol, at the ticks until the end.
+        let mut sampled = arranged.unwrap_or_else(|| recorded.clone());
+        let frames = scene.frames.unwrap_or(usize::MAX);
+        sampled.ticks.truncate(scene.seek.saturating_add(frames));
         let (scale, rule) = (scene.intensity_scale, &protocol.ground_truth);
-        let findings = findings::sampled(std::slice::from_ref(recorded), scale, Some(rule));
+        let findings = findings::sampled(&[sampled], scale, Some(rule));
+        let mut left_out = LeftOut::default();
+        left_out.add_files(&dataset.problems);
+        left_out.add_findings(findings.clone());
         // What the file left open is filled in, so that the scenario.yaml of the run is complete.
         scene.scenario = Some(recorded.name.clone());
         scene.agents.clone_from(&agents);
@@ -177,6 +185,7 @@ impl Fleet {
             detector,
             protocol,
             findings,
+            left_out,
         })
     }
 
@@ -227,11 +236,8 @@ impl Fleet {
         keys.transpose()
     }
 
-    /// Digests of the programs, and of all files that the run reads.
-    ///
-    /// # Errors
-    /// The first file that cannot be read, by name.
-    pub(crate) fn provenance(&self, programs: &Path) -> io::Result<Provenance> {
+    /// Digests of the programs, and of all files that the run reads; the first file that cannot be read is a warning.
+    pub(crate) fn provenance(&self, programs: &Path) -> Option<Provenance> {
         let (scenario, scene) = (&self.scenario, &self.scenario.scene);
         let vehicles = self.agents.iter().map(|cav| self.settings_of(cav));
         let vehicles: Vec<_> = vehicles.collect();
@@ -250,6 +256,8 @@ impl Fleet {
         let data_sha256 = dataset::content_sha256([&data], scene.variant.as_deref(), &digests);
         let (programs, commit) = (Self::programs(programs), env!("V2VLOC_COMMIT"));
         Provenance::collect(&programs, data_sha256, files, commit, &digests)
+            .inspect_err(|error| tracing::warn!("no hashes of what the run read: {error}"))
+            .ok()
     }
 
     /// Executables of a fleet.
@@ -319,6 +327,18 @@ pub(crate) fn unused_weights(scenario: &Scenario, ego: &CavId) -> Option<String>
     ))
 }
 
+/// Sentence about the ticks of a scene at which the recording has no frame of the ego: they are none of the run's. Of a
+/// repeated scene those of one lap.
+pub(crate) fn ego_absences(of: &Recorded, ego: &CavId, scene: &SceneConfig) -> Option<String> {
+    let place = of.agents.iter().position(|cav| cav == ego)?;
+    let ticks = (scene.seek..of.ticks.len()).take(scene.frames.unwrap_or(usize::MAX));
+    let absent = ticks.filter(|tick| !of.is_present(place, *tick)).count();
+    let name = &of.name;
+    (absent > 0).then(|| {
+        format!("scenario {name}: no frame of the ego {ego} at {absent} ticks, which do not count")
+    })
+}
+
 #[cfg(test)]
 mod tests {
     use std::fs;
@@ -340,6 +360,33 @@ mod tests {
             "{found}"
         );
         assert_eq!(of_other, None);
+    }
+
+    #[test]
+    fn ticks_at_which_the_recording_lacks_the_ego_are_named() {
+        let folder = tempfile::tempdir().unwrap();
+        for (agent, ticks) in [("1", &[0, 1, 2, 3][..]), ("2", &[0, 3])] {
+            fs::create_dir(folder.path().join(agent)).unwrap();
+            for tick in ticks {
+                let sweep = folder.path().join(format!("{agent}/{tick:06}.pcd"));
+                let pose = "lidar_pose: [0, 0, 2, 0, 0, 0]\nvehicles: {}\n";
+                fs::write(sweep.with_extension("yaml"), pose).unwrap();
+                fs::write(sweep, "").unwrap();
+            }
+        }
+        let recorded = dataset::open(folder.path()).unwrap().scenarios.remove(0);
+        let file = folder.path().join("s.yaml");
+        fs::write(&file, "scene: {dir: .}\nmodels: {weights: .}\n").unwrap();
+        let mut scene = Scenario::read(&file).unwrap().scene;
+        let of = |ego, scene: &SceneConfig| {
+            ego_absences(&recorded, &CavId::new(ego).unwrap(), scene).unwrap_or_default()
+        };
+        assert_eq!(of("1", &scene), "");
+        let all = of("2", &scene);
+        assert!(all.contains("ego 2 at 2 ticks"), "{all}");
+        (scene.seek, scene.frames) = (1, Some(1));
+        let cut = of("2", &scene);
+        assert!(cut.contains("ego 2 at 1 ticks"), "{cut}");
     }
 
     #[test]

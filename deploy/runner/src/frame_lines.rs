@@ -47,7 +47,10 @@ impl FrameLines {
         scenario: Option<&str>,
         frame: &EvaluatedFrame,
     ) -> ControlFlow<()> {
-        self.scenarios.extend(scenario.map(str::to_owned));
+        // As in frames.csv, whose rows they name.
+        let has_row = frame.failure.is_none() || frame.true_pose().is_some();
+        let named = scenario.filter(|_| has_row).map(str::to_owned);
+        self.scenarios.extend(named);
         if self.written.is_ok() {
             self.written = self.write(scenario, frame);
         }
@@ -73,14 +76,16 @@ impl FrameLines {
             let line = FrameReport::new(&frame.stamp, tick, tracks);
             write_line(out, &ScenarioLine { scenario, line })?;
         }
-        let ego = &frame.result.ego;
-        let own = frame.frames.iter().find(|recorded| recorded.cav == *ego);
+        // The vehicle has driven on, but nothing tells where the true boxes are.
+        let Some(world_from_ego) = frame.true_pose() else {
+            return Ok(());
+        };
         let line = TruthLine {
             tick: frame.tick as u64,
             capture_nanos: frame.stamp.capture_nanos,
             publish_nanos: frame.stamp.capture_nanos,
-            ego: ego.clone(),
-            world_from_ego: own.and_then(|recorded| recorded.world_from_lidar),
+            ego: frame.result.ego.clone(),
+            world_from_ego: Some(world_from_ego),
             truth: frame.truth.clone(),
         };
         write_line(&mut self.truth, &ScenarioLine { scenario, line })

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use crate::ros::{AgentTopic, ClockMode, MotionSource, NodeOptions, NodeReport, RosSession, run};
 use anyhow::{Context, bail, ensure};
 use bus::shutdown::Stop;
-use bus::{Bus, BusOptions, Endpoint, STOP_LIMIT, open_unless};
+use bus::{Bus, BusOptions, Endpoint, open_unless};
 use dataset::IntensityScale;
 use protocol::{CavId, Principal, Role, RunId};
 use ros2::{Distribution, MotionType, Mount, RosName};
@@ -136,9 +136,7 @@ impl Arguments {
         let report = run(&bus, &session, &self.options(), &stop)?;
         // Withdraws the tokens, so that other nodes see this one leave.
         drop(session);
-        if let Err(overdue) = bus.leave(STOP_LIMIT) {
-            tracing::warn!("{overdue}");
-        }
+        bus.leave_at_end();
         print(&report, self.json)?;
         Ok(Outcome::of(!report.is_complete() || report.left_out > 0))
     }

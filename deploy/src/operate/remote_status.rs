@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use bus::bounded_queue::Pop;
 use bus::{Bus, BusError, present};
-use protocol::{CavId, Detections, KeyExpr, Limits, Stamp, Stats, Stream, Topic, wire};
+use protocol::{CavId, Detections, KeyExpr, Limits, Stamp, Stats, Stream, Topic, Verb, wire};
 use serde::Serialize;
 use terminal::text_table::number;
 
@@ -25,6 +25,8 @@ pub enum RemoteState {
     Silent,
     /// It has left since its last report.
     Gone,
+    /// The same after the end of the scene.
+    Ended,
 }
 
 /// A process of a run.
@@ -83,6 +85,7 @@ impl RemoteStatus {
             KeyExpr::stats(run),
             KeyExpr::stream(run, Stream::Detections),
             KeyExpr::truth(run),
+            KeyExpr::one(&bus.key(Topic::Control(Verb::End))),
         ];
         let subscriber = bus.tap(&selectors, PLACES)?;
         let mut seen = Seen::default();
@@ -105,18 +108,15 @@ impl RemoteStatus {
         if self.processes.is_empty() {
             return vec!["no process of it is connected to this router".to_owned()];
         }
-        let troubles = self
-            .processes
-            .iter()
-            .flat_map(|process| match process.state {
-                RemoteState::Alive => process
-                    .problems
-                    .iter()
-                    .map(|problem| format!("{}: {problem}", process.name))
-                    .collect(),
-                RemoteState::Silent => vec![format!("{} is silent", process.name)],
-                RemoteState::Gone => vec![format!("{} has left", process.name)],
-            });
+        let troubles = self.processes.iter().flat_map(|process| {
+            let (name, problems) = (&process.name, process.problems.iter());
+            match process.state {
+                RemoteState::Alive => problems.map(|of| format!("{name}: {of}")).collect(),
+                RemoteState::Silent => vec![format!("{name} is silent")],
+                RemoteState::Gone => vec![format!("{name} has left")],
+                RemoteState::Ended => vec![],
+            }
+        });
         troubles.collect()
     }
 
@@ -162,6 +162,8 @@ struct Seen {
     results: BTreeMap<CavId, (u64, RemoteEgo)>,
     /// Time of publication of each tick, by capture time, nanoseconds.
     ticks: BTreeMap<u64, u64>,
+    /// True after the end of the scene.
+    has_ended: bool,
 }
 
 impl Seen {
@@ -196,6 +198,7 @@ impl Seen {
                 let stamp = wire::decode_header(pieces).ok()?.stamp;
                 self.ticks.insert(stamp.capture_nanos, stamp.publish_nanos);
             }
+            Topic::Control(Verb::End) => self.has_ended = true,
             _ => {}
         }
         Some(())
@@ -212,6 +215,7 @@ impl Seen {
                 state: match (alive.contains(*name), last) {
                     (true, Some(_)) => RemoteState::Alive,
                     (true, None) => RemoteState::Silent,
+                    (false, _) if self.has_ended => RemoteState::Ended,
                     (false, _) => RemoteState::Gone,
                 },
                 cores: reports.and_then(cores),
@@ -322,6 +326,21 @@ mod tests {
             ]
         );
         insta::assert_snapshot!(status.table());
+    }
+
+    #[test]
+    fn a_process_that_leaves_after_the_end_of_the_scene_has_ended() {
+        for is_over in [false, true] {
+            let mut seen = Seen::default();
+            report(&mut seen, "agent-1000", 1.0, 10.0);
+            if is_over {
+                seen.add(&Topic::Control(Verb::End), &[]);
+            }
+            let status = seen.status("test".into(), Duration::from_secs(2), &BTreeSet::new());
+            assert_eq!(status.troubles().is_empty(), is_over);
+            let ended = status.processes[0].state == RemoteState::Ended;
+            assert_eq!(ended, is_over);
+        }
     }
 
     #[test]

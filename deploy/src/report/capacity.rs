@@ -90,6 +90,8 @@ impl fmt::Display for Capacity {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let (cores, vehicles) = (self.machine.cores, self.vehicles);
         let plurals = [cores, vehicles].map(|count| if count == 1 { "" } else { "s" });
+        // All ten are those of a machine that keeps up.
+        let most = if self.keeps_up() { 10.0 } else { 9.0 };
         write!(
             f,
             "{cores} core{}, {}; {} with {vehicles} vehicle{} needs about {:.0} ms of CPU per frame of {:.0} available: \
@@ -100,7 +102,7 @@ impl fmt::Display for Capacity {
             plurals[1],
             self.needed_ms,
             self.available_ms,
-            (10.0 * self.expected_share).round()
+            (10.0 * self.expected_share).round().min(most)
         )
     }
 }

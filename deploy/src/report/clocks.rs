@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::fmt;
 
-use bus::{NETWORK_TRANSIT_S, is_same_clock};
+use bus::{is_same_clock, longest_transit_s};
 use protocol::CavId;
 use serde::{Deserialize, Serialize};
 
@@ -18,13 +18,17 @@ pub struct OtherClock {
     pub capture_s: Option<f64>,
 }
 
-/// Neighbours with another clock than the ego.
-pub(super) fn others(neighbours: &BTreeMap<CavId, NeighbourRecord>) -> BTreeMap<CavId, OtherClock> {
+/// Neighbours with another clock than the ego, as the ego judges: over a link a transit may be long.
+pub(super) fn others(
+    neighbours: &BTreeMap<CavId, NeighbourRecord>,
+    over_link: bool,
+) -> BTreeMap<CavId, OtherClock> {
+    let longest_s = longest_transit_s(over_link);
     let others = neighbours.iter().filter_map(|(cav, record)| {
         let clock = OtherClock {
             system_s: record
                 .clock_offset_s
-                .filter(|offset_s| !is_same_clock(*offset_s, NETWORK_TRANSIT_S)),
+                .filter(|offset_s| !is_same_clock(*offset_s, longest_s)),
             capture_s: record.capture_offset_s,
         };
         (clock != OtherClock::default()).then(|| (cav.clone(), clock))
@@ -58,6 +62,7 @@ mod tests {
             ("1", Some(-0.002), None),
             ("2", Some(3.0), Some(0.3)),
             ("3", None, Some(-0.1)),
+            ("4", Some(-0.351), None),
         ];
         let neighbours = neighbours.map(|(cav, clock_offset_s, capture_offset_s)| {
             let record = NeighbourRecord {
@@ -67,16 +72,19 @@ mod tests {
             };
             (CavId::new(cav).unwrap(), record)
         });
-        let lines: Vec<String> = others(&neighbours.into())
-            .iter()
-            .map(|(cav, clock)| format!("{cav}: {clock}"))
-            .collect();
-        assert_eq!(
-            lines,
-            [
-                "2: clock 3.000 s ahead, durations from it not measurable; capture times 0.300 s ahead, corrected",
-                "3: capture times 0.100 s behind, corrected",
-            ]
-        );
+        let neighbours = neighbours.into();
+        let [direct, over_link] = [false, true].map(|over_link| {
+            let others = others(&neighbours, over_link);
+            let lines = others.iter().map(|(cav, clock)| format!("{cav}: {clock}"));
+            lines.collect::<Vec<_>>()
+        });
+        let beyond_link = [
+            "2: clock 3.000 s ahead, durations from it not measurable; capture times 0.300 s ahead, corrected",
+            "3: capture times 0.100 s behind, corrected",
+        ];
+        assert_eq!(over_link, beyond_link);
+        assert_eq!(direct[..2], beyond_link);
+        let behind = "4: clock 0.351 s behind, or as long a transit";
+        assert_eq!(direct[2..], [behind]);
     }
 }

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use protocol::Role;
+use protocol::{Account, CavId, Role, Stream, Topic};
 use serde::{Deserialize, Serialize};
 
 use super::Spread;
@@ -34,7 +34,10 @@ pub struct RunPace {
 pub struct AgentPace {
     /// Number of sweeps computed, over all instances of the process.
     pub computed: u64,
-    /// Share of the ticks, 0..=1.
+    /// Number of sweeps that were sent to it; `None`: not known, the ticks count.
+    #[serde(default)]
+    pub sent: Option<u64>,
+    /// Share of these, 0..=1.
     pub share: f64,
 }
 
@@ -89,13 +92,24 @@ fn agents(processes: &[ProcessStats], ticks: u64) -> BTreeMap<String, AgentPace>
         let Some(cav) = name.and_then(|rest| rest.strip_prefix('-')) else {
             continue;
         };
-        let pace = agents.entry(cav.to_owned()).or_default();
-        pace.computed += sweeps(stats);
-        if ticks > 0 {
-            pace.share = pace.computed as f64 / ticks as f64;
+        agents.entry(cav.to_owned()).or_default().computed += sweeps(stats);
+    }
+    for (cav, pace) in &mut agents {
+        // A vehicle may be there for a part of the scene.
+        pace.sent = sent(processes, cav).filter(|sent| *sent > 0);
+        let of = pace.sent.unwrap_or(ticks);
+        if of > 0 {
+            pace.share = pace.computed as f64 / of as f64;
         }
     }
     agents
+}
+
+/// Number of sweeps that all instances of the replay, or of its sender, sent to a vehicle.
+fn sent(processes: &[ProcessStats], cav: &str) -> Option<u64> {
+    let account = Account::published(Topic::stream(&CavId::new(cav).ok()?, Stream::Lidar));
+    let counts = processes.iter().filter_map(|of| of.ledger.get(&account));
+    Some(counts.map(|counts| counts.sent).sum())
 }
 
 /// Number of sweeps that an agent has computed.

@@ -1,5 +1,5 @@
 use dataset::evaluation_protocol::{ApOrder, EvaluationProtocol};
-use protocol::{Ledger, ProcessUsage, StageSummary, ThreadUsage, TopicTraffic};
+use protocol::{Account, Ledger, ProcessUsage, StageSummary, ThreadUsage, TopicTraffic};
 use support::provenance::Provenance;
 
 use super::*;
@@ -122,6 +122,7 @@ fn the_pace_counts_computed_and_answered_ticks_and_the_time_between_detections()
         pace.agents["1"],
         AgentPace {
             computed: 4,
+            sent: None,
             share: 1.0
         }
     );
@@ -129,6 +130,7 @@ fn the_pace_counts_computed_and_answered_ticks_and_the_time_between_detections()
         pace.agents["2"],
         AgentPace {
             computed: 3,
+            sent: None,
             share: 0.75
         },
         "both instances"
@@ -142,6 +144,28 @@ fn the_pace_counts_computed_and_answered_ticks_and_the_time_between_detections()
         "{pace:?}"
     );
     assert!(is_near(latency_ms.p50, 100.0) && is_near(latency_ms.max, 300.0));
+}
+
+#[test]
+fn a_vehicle_that_is_there_for_a_part_of_the_scene_computes_all_sweeps_sent_to_it() {
+    let lidar = Account::published("2/lidar".parse().unwrap());
+    let mut replay = process("replay", ("read", 4, 1.0), [0.1, 0.1], "2/lidar");
+    (0..2).for_each(|_| replay.ledger.sent(&lidar));
+    let agent = process("agent-2", ("agent", 2, 60.0), [0.9, 0.5], "2/bev");
+    let metrics = Metrics {
+        ticks: 4,
+        answered: 4,
+        ..metrics("max")
+    };
+    let name = "r1".parse().unwrap();
+    let report = RunReport::new(&name, &metrics, &[], &[replay, agent], None);
+    let expected = AgentPace {
+        computed: 2,
+        sent: Some(2),
+        share: 1.0,
+    };
+    assert_eq!(report.pace.agents["2"], expected);
+    assert!(report.to_string().contains("computed  2 2/2 (100 %)"));
 }
 
 #[test]
@@ -236,6 +260,13 @@ fn a_report_reads_back_and_is_a_table_for_people() {
         available_ms: 200.0,
         expected_share: 0.6,
     };
+    for (expected_share, answered) in [(0.985, "about 9 of 10"), (0.99, "about 10 of 10")] {
+        let capacity = Capacity {
+            expected_share,
+            ..capacity.clone()
+        };
+        assert!(capacity.to_string().contains(answered), "{capacity}");
+    }
     let report = RunReport {
         capacity: Some(capacity),
         ..report()

@@ -55,7 +55,8 @@ impl fmt::Display for RunPace {
             "pace      answered {answered}/{ticks} ({share}){rate}; between detections {interval}"
         )?;
         let agents = self.agents.iter().map(|(cav, pace)| {
-            format!("{cav} {}/{ticks} ({})", pace.computed, percent(pace.share))
+            let (computed, sent) = (pace.computed, pace.sent.unwrap_or(ticks));
+            format!("{cav} {computed}/{sent} ({})", percent(pace.share))
         });
         match agents.collect::<Vec<_>>().as_slice() {
             [] => Ok(()),

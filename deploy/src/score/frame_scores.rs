@@ -17,7 +17,7 @@ use super::true_boxes::ground_truth;
 use super::truth_line::TruthLine;
 use crate::score::metrics::{ByIou, PartPrecision};
 
-/// Gap between two frames beyond which they belong to two scenarios, nanoseconds.
+/// Gap between two frames beyond which they belong to two scenarios, or to two rounds of one, nanoseconds.
 const SCENARIO_GAP_NANOS: u64 = 10_000_000_000;
 
 /// Scores so far. Ticks are scored in the order of their capture times, independent of the order of their messages.
@@ -26,7 +26,7 @@ pub struct FrameScores {
     rule: GroundTruthRule,
     pub(super) nominal_values: u64,
     open: OpenTicks,
-    scorer: Scorer,
+    pub(super) scorer: Scorer,
     pub(super) live: LivePrecision,
     records: Vec<FrameRecord>,
     pub(super) pose_errors: Vec<PoseError>,
@@ -116,12 +116,13 @@ impl FrameScores {
         &self.records
     }
 
-    /// Number of ticks so far, and of those with a result of the ego.
+    /// Number of ticks so far at which the truth has the ego, and of those with a result of it.
     pub fn ticks(&self) -> (u64, u64) {
         self.live.ticks()
     }
 
-    /// Ticks whose result counts in no precision, as the recording has no true pose of the ego.
+    /// Ticks at which the truth lacks the ego: it has no sweep there, or the recording has no true pose of it. They
+    /// count in no score, and only those with a result have a record.
     pub fn unplaced(&self) -> &[u64] {
         &self.unplaced
     }
@@ -208,14 +209,6 @@ impl FrameScores {
             .collect();
         // Poses count whether or not the ego has answered.
         self.judge_poses(&tick.poses, &world_from_lidar);
-        let is_there = world_from_lidar.iter().any(|(cav, _)| *cav == self.ego);
-        if tick.result.is_none() && !is_there && !world_from_lidar.is_empty() {
-            // The ego takes no part at this tick, so no result is missing.
-            return;
-        }
-        if tick.result.is_some() && !is_there {
-            self.unplaced.push(truth.tick);
-        }
         let objects = ground_truth(&truth, &self.ego, &self.rule);
         let answer = tick.result.map(|(done_nanos, result)| {
             let stamps = StageStamps::of(began_nanos, tick.posed_nanos, done_nanos, &result.stages);
@@ -261,20 +254,33 @@ impl FrameScores {
         objects: &GroundTruth,
         world_from_lidar: Vec<(CavId, Pose)>,
     ) {
+        let last_nanos = self.records.last().map(|last| last.capture_nanos);
+        if last_nanos.is_some_and(|last| last.abs_diff(capture_nanos) >= SCENARIO_GAP_NANOS) {
+            self.live.forget();
+        }
         let world_from_ego = true_pose(&world_from_lidar, &self.ego).copied();
-        let ego_tick = EgoTick {
-            number: tick,
-            began_nanos,
-            world_from_ego,
-        };
+        self.unplaced
+            .extend(world_from_ego.is_none().then_some(tick));
+        // The ego may take no part at this tick, so no result is missing.
+        if world_from_ego.is_none() && answer.is_none() {
+            return;
+        }
         let published_nanos = answer.as_ref().and_then(|(_, nanos, _)| *nanos);
         let detections = answer.as_ref().map(|(.., result)| &result.detections[..]);
-        let live = &mut self.live;
+        let streamed = world_from_ego.and_then(|world_from_ego| {
+            let ego_tick = EgoTick {
+                number: tick,
+                began_nanos,
+                world_from_ego,
+            };
+            self.live
+                .add(ego_tick, objects, detections, published_nanos)
+        });
         let mut record = FrameRecord {
             tick,
             capture_nanos,
             truth: objects.objects.len(),
-            streamed: live.add(ego_tick, objects, detections, published_nanos),
+            streamed,
             ..FrameRecord::default()
         };
         let Some((stamps, _, result)) = answer else {
@@ -308,12 +314,15 @@ impl FrameScores {
         neighbours::add(&mut self.neighbours, &result);
         self.bytes.extend(bytes);
         self.ages_ms.extend(ages_ms);
-        self.keep_showpiece(JudgedFrame {
-            tick,
-            result,
-            truth: objects.boxes().collect(),
-            world_from_lidar,
-        });
+        // Without the ego's pose nothing tells where to draw the others.
+        if world_from_ego.is_some() {
+            self.keep_showpiece(JudgedFrame {
+                tick,
+                result,
+                truth: objects.boxes().collect(),
+                world_from_lidar,
+            });
+        }
     }
 
     fn judge_poses(&mut self, poses: &[(CavId, PoseEstimate)], truth: &[(CavId, Pose)]) {

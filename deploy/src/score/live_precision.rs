@@ -40,7 +40,7 @@ pub(super) struct EgoTick {
     /// Time of publication of the tick, nanoseconds.
     pub(super) began_nanos: u64,
     /// True pose of the ego's LiDAR.
-    pub(super) world_from_ego: Option<Pose>,
+    pub(super) world_from_ego: Pose,
 }
 
 impl LivePrecision {
@@ -74,10 +74,6 @@ impl LivePrecision {
             self.is_untimed = true;
             return streamed;
         };
-        // Boxes of unknown motion would displace those of the tick before, which can be moved to a later tick.
-        if tick.world_from_ego.is_none() {
-            return streamed;
-        }
         self.published.push_back(PublishedAnswer {
             nanos,
             tick,
@@ -117,9 +113,8 @@ impl LivePrecision {
         let index = published.rposition(|published| published.nanos <= tick.began_nanos)?;
         self.published.drain(..index);
         let newest = self.published.front()?;
-        // Without both poses the motion is unknown.
-        let (now, then) = (tick.world_from_ego?, newest.tick.world_from_ego?);
-        let now_from_then = now.from_world(&then).isometry();
+        let then = &newest.tick.world_from_ego;
+        let now_from_then = tick.world_from_ego.from_world(then).isometry();
         let moved = newest.detections.iter().map(|found| Detection {
             box3d: found.box3d.transformed(&now_from_then),
             ..found.clone()
@@ -165,7 +160,7 @@ mod tests {
             let began_nanos = 1_000_000_000 + tick * 100_000_000;
             let ego_x = tick as f64;
             let truth = truth_at(20.0 + speed_m * tick as f64 - ego_x);
-            let world_from_ego = Some(Pose::from_xyz_yaw([ego_x, 0.0, 0.0], 0.0));
+            let world_from_ego = Pose::from_xyz_yaw([ego_x, 0.0, 0.0], 0.0);
             let found = [Detection {
                 box3d: truth.objects[0].box3d,
                 score: 0.9,
@@ -241,7 +236,7 @@ mod tests {
         }];
         for (tick, truth) in (0..).zip(&[truth_at(-48.0), truth_at(10.0)]) {
             let began_nanos = 1_000 * tick;
-            let world_from_ego = Some(Pose::from_xyz_yaw([5.0 * tick as f64, 0.0, 0.0], 0.0));
+            let world_from_ego = Pose::from_xyz_yaw([5.0 * tick as f64, 0.0, 0.0], 0.0);
             let detections = (tick == 0).then_some(&found[..]);
             let tick = EgoTick {
                 number: tick,
@@ -261,36 +256,6 @@ mod tests {
     }
 
     #[test]
-    fn a_result_without_the_true_pose_of_the_ego_is_not_moved_to_a_later_tick() {
-        let mut live = LivePrecision::default();
-        let nowhere = GroundTruth {
-            area_m: [f64::MAX, f64::MAX, f64::MIN, f64::MIN],
-            ..GroundTruth::of_boxes([])
-        };
-        // The ego drives 5 m a tick, towards a car at 20 m; the recording does not say where it is at the second tick.
-        let truths = [truth_at(20.0), nowhere, truth_at(10.0)];
-        let streamed = (0..).zip(&truths).map(|(tick, truth)| {
-            let ego_x = 5.0 * tick as f64;
-            let began_nanos = tick * 100_000_000;
-            let found = [Detection {
-                box3d: car(20.0 - ego_x),
-                score: 0.9,
-                source: None,
-            }];
-            let published_nanos = Some(began_nanos + 50_000_000);
-            let tick = EgoTick {
-                number: tick,
-                began_nanos,
-                world_from_ego: (tick != 1).then(|| Pose::from_xyz_yaw([ego_x, 0.0, 0.0], 0.0)),
-            };
-            let streamed = live.add(tick, truth, Some(&found), published_nanos);
-            streamed.map(|streamed| (streamed.tick, streamed.found))
-        });
-        assert_eq!(streamed.collect::<Vec<_>>(), [None, None, Some((0, 1))]);
-        assert_eq!(live.streaming().unwrap().at_70, Some(0.5));
-    }
-
-    #[test]
     fn results_without_a_time_have_no_streaming_precision() {
         let mut live = LivePrecision::default();
         let truth = truth_at(10.0);
@@ -302,7 +267,7 @@ mod tests {
         let tick = EgoTick {
             number: 0,
             began_nanos: 0,
-            world_from_ego: None,
+            world_from_ego: Pose::IDENTITY,
         };
         live.add(tick, &truth, Some(&found), None);
         assert_eq!(

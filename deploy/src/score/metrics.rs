@@ -9,14 +9,11 @@ use dataset::evaluation_protocol::{ApOrder, EvaluationProtocol};
 use protocol::{CavId, Counts, DropReason, Ledger, PoseError, Topic};
 use serde::{Deserialize, Serialize};
 use support::provenance::Provenance;
-use support::statistics::{mean, quantile, sorted};
+use support::statistics::{SUCCESS_M, mean, quantile, sorted};
 
 use crate::score::{FrameScores, NeighbourRecord};
 
 pub use contribution::Contribution;
-
-/// Pose error below which localization counts as a success, metres.
-const SUCCESS_M: f64 = 3.0;
 
 /// File name in the folder of a run.
 pub const FILE: &str = "metrics.json";
@@ -26,15 +23,17 @@ pub const FILE: &str = "metrics.json";
 pub struct Metrics {
     /// Number of frames that the ego reported.
     pub frames: u64,
-    /// Number of ticks of the scene; without a network all are answered.
+    /// Number of ticks of the scene at which the recording has the ego and its true pose; without a network all are
+    /// answered.
     #[serde(default)]
     pub ticks: u64,
     /// Number of ticks with detections; the others are unanswered.
     #[serde(default)]
     pub answered: u64,
-    /// From the first to the last detections, seconds of wall time.
+    /// Duration by `clock`, seconds. `wall`: between the arrivals of the first and the last detections; `stepped`: between
+    /// the captures of the first and the last tick; `offline`: wall time of the whole evaluation.
     pub seconds: f64,
-    /// Clock of the run.
+    /// Clock: `wall`, `stepped` (simulation time) or `offline` (no time passes).
     pub clock: String,
     /// Fusion method.
     pub method: String,
@@ -65,8 +64,8 @@ pub struct Metrics {
     pub pose: PoseErrors,
     /// Latencies.
     pub latency_ms: Latencies,
-    /// Age of neighbours' data: capture time of the ego's sweep less that of the neighbour's, per neighbour and frame
-    /// that was fused, milliseconds.
+    /// Age of neighbours' data: capture time of the ego's sweep less that of a neighbour's oldest fused message, per
+    /// neighbour and frame that was fused, milliseconds.
     #[serde(default)]
     pub age_ms: Percentiles,
     /// Transmitted data.
@@ -77,7 +76,7 @@ pub struct Metrics {
     /// Every neighbour from which the ego received messages.
     #[serde(default)]
     pub neighbours: BTreeMap<CavId, NeighbourRecord>,
-    /// Totals of the ledger.
+    /// Totals of the ledger. `wall`: of all processes; `stepped`: of the neighbours' messages to the ego.
     pub messages: Messages,
     /// The evaluation protocol, with the ground-truth range as it was applied.
     pub protocol: Option<EvaluationProtocol>,
@@ -104,8 +103,10 @@ impl Metrics {
         let fused = records.clone().map(|record| record.fused).sum();
         let [ap_global, ap_frame_order] = scores.average_precision();
         let [ap_by_distance, ap_by_class] = scores.average_precision_by_part();
-        let latencies_ms = records.filter_map(|record| record.latency_ms);
+        let latencies_ms = records.clone().filter_map(|record| record.latency_ms);
         let (ticks, answered) = scores.ticks();
+        let results = records.filter(|record| record.is_answered());
+        let results = results.count() as u64;
         // In an evaluation, where all bytes are known, the own agent has no account, and the ego of one scenario may be a
         // neighbour in another.
         let ego = sent_bytes.is_none().then_some(&scores.ego);
@@ -113,7 +114,10 @@ impl Metrics {
             Some(_) => Messages::of_run(ledger),
             None => Messages::of_evaluation(ledger, |_| true),
         };
+        let mut left_out = LeftOut::default();
+        left_out.add_scores(method, &scores.scorer);
         Self {
+            left_out,
             frames: answered,
             ticks,
             answered,
@@ -134,7 +138,7 @@ impl Metrics {
             },
             age_ms: Percentiles::of(&scores.ages_ms),
             comm: Communication::of(&scores.bytes, scores.nominal_values),
-            contribution: Contribution::of(answered, fused, ego, ledger, sent_bytes),
+            contribution: Contribution::of(results, fused, ego, ledger, sent_bytes),
             neighbours: scores.neighbours.clone(),
             messages,
             ..Self::default()
@@ -242,7 +246,7 @@ pub struct Communication {
 /// Number of messages that may be in flight at the end of any run.
 const FEW: u64 = 20;
 
-/// Messages of all processes.
+/// Number of messages, of those that the ledger counts.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct Messages {
     /// Published, once per receiver.
@@ -292,11 +296,8 @@ impl Messages {
     /// scenario.
     pub fn of_evaluation(ledger: &Ledger, is_counted: impl Fn(&Topic) -> bool) -> Self {
         let mut total = Counts::default();
-        for (account, counts) in ledger.iter() {
-            if is_counted(&account.topic) {
-                total.add(counts);
-            }
-        }
+        let counted = ledger.iter().filter(|(of, _)| is_counted(&of.topic));
+        counted.for_each(|(_, counts)| total.add(counts));
         Self::of(total, 0)
     }
 

@@ -439,12 +439,10 @@ impl ScorerWorker {
         }
         let (name, at) = (process.to_string(), arrival.at);
         // Until the first tick: the loading of models belongs to no frame.
-        let known = self.stats.get(&instance);
-        let usage_before = match self.recent.is_empty() {
-            true => report.usage.clone(),
-            false => known
-                .map(|known| known.usage_before.clone())
-                .unwrap_or_default(),
+        let usage_before = match self.stats.get(&instance) {
+            _ if self.recent.is_empty() => report.usage.clone(),
+            Some(known) => known.usage_before.clone(),
+            None => ProcessUsage::default(),
         };
         let stats = ProcessStats {
             process,

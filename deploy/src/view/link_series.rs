@@ -1,6 +1,6 @@
 //! Traffic of each link over a recorded run: rate, time on the link and backlog, from one scene frame to the next.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use protocol::{CavId, HEADER_LEN, Stream, Topic};
 use recording::Entry;
@@ -15,7 +15,7 @@ pub(crate) struct LinkTraffic {
     pub from: CavId,
     /// Bytes of its messages for this frame.
     pub sent_bytes: u64,
-    /// From publication to arrival of the last of these to arrive, milliseconds; `None`: none has arrived.
+    /// From publication to arrival of the last of these, milliseconds; `None`: a message of perception has not.
     pub transit_ms: Option<f64>,
     /// Bytes that were on their way when the tick was published: of earlier messages, those that arrived later.
     /// Messages that were lost do not count.
@@ -28,10 +28,10 @@ pub(super) struct LinkSeries(BTreeMap<CavId, LinkMessages>);
 
 #[derive(Debug, Default)]
 struct LinkMessages {
-    /// Bytes by capture time.
-    sent: BTreeMap<u64, u64>,
-    /// Longest time from publication to arrival by capture time, milliseconds.
-    transit_ms: BTreeMap<u64, f64>,
+    /// Streams but the pose, and bytes, by capture time.
+    sent: BTreeMap<u64, (BTreeSet<Stream>, u64)>,
+    /// Streams that arrived, and the longest time from publication to arrival, milliseconds, by capture time.
+    transits: BTreeMap<u64, (BTreeSet<Stream>, f64)>,
     /// Bytes of those that arrived, by time of publication.
     published: Vec<(u64, u64)>,
     /// The same by time of arrival.
@@ -61,17 +61,24 @@ impl LinkSeries {
             let link = series.0.entry(cav.clone()).or_default();
             let (stamp, bytes) = (&entry.header.stamp, bytes(entry));
             if is_sent {
-                *link.sent.entry(stamp.capture_nanos).or_default() += bytes;
+                let (streams, sum) = link.sent.entry(stamp.capture_nanos).or_default();
+                // A message of perception has its pose too.
+                streams.extend(Some(stream).filter(|stream| *stream != Stream::Pose));
+                *sum += bytes;
             }
             if is_arrived {
                 let transit_ms = ms_between(stamp.publish_nanos, entry.arrived_nanos);
-                let longest = link.transit_ms.entry(stamp.capture_nanos);
-                let longest = longest.or_insert(transit_ms);
-                *longest = longest.max(transit_ms);
+                let transit = link.transits.entry(stamp.capture_nanos);
+                let (streams, longest_ms) = transit.or_insert((BTreeSet::new(), transit_ms));
+                streams.insert(stream);
+                *longest_ms = longest_ms.max(transit_ms);
                 link.published.push((stamp.publish_nanos, bytes));
                 link.arrived.push((entry.arrived_nanos, bytes));
             }
         }
+        // Poses alone, where the rest is not recorded, are not the traffic of a link.
+        let has_perception = |link: &LinkMessages| link.sent.values().any(|of| !of.0.is_empty());
+        series.0.retain(|_, link| has_perception(link));
         for link in series.0.values_mut() {
             accumulate(&mut link.published);
             accumulate(&mut link.arrived);
@@ -81,14 +88,20 @@ impl LinkSeries {
 
     /// Traffic of every link for the frame of a capture time, whose tick was published at `began_nanos`.
     pub(super) fn at(&self, capture_nanos: u64, began_nanos: Option<u64>) -> Vec<LinkTraffic> {
-        let traffic = self.0.iter().map(|(from, link)| LinkTraffic {
-            from: from.clone(),
-            sent_bytes: link.sent.get(&capture_nanos).copied().unwrap_or(0),
-            transit_ms: link.transit_ms.get(&capture_nanos).copied(),
-            // What was published less what has arrived is on its way. With two clocks a message can arrive
-            // before it is published, and the difference stays at 0.
-            waiting_bytes: began_nanos
-                .map(|now| until(&link.published, now).saturating_sub(until(&link.arrived, now))),
+        let traffic = self.0.iter().map(|(from, link)| {
+            let sent = link.sent.get(&capture_nanos);
+            let transit = link.transits.get(&capture_nanos);
+            let has_all = |arrived| sent.is_none_or(|(sent, _)| sent.is_subset(arrived));
+            LinkTraffic {
+                from: from.clone(),
+                sent_bytes: sent.map_or(0, |(_, bytes)| *bytes),
+                transit_ms: transit.and_then(|(arrived, ms)| has_all(arrived).then_some(*ms)),
+                // What was published less what has arrived is on its way. With two clocks a message can arrive
+                // before it is published, and the difference stays at 0.
+                waiting_bytes: began_nanos.map(|now| {
+                    until(&link.published, now).saturating_sub(until(&link.arrived, now))
+                }),
+            }
         });
         traffic.collect()
     }
@@ -117,6 +130,20 @@ fn until(accumulated: &[(u64, u64)], nanos: u64) -> u64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn the_transit_of_a_sweep_is_not_that_of_its_pose_where_its_map_is_lost() {
+        let [map, pose] = [Stream::Bev, Stream::Pose].map(|stream| BTreeSet::from([stream]));
+        let link = LinkMessages {
+            sent: [1, 2].map(|tick| (tick, (map.clone(), 900))).into(),
+            transits: [(1, (map, 300.0)), (2, (pose, 2.0))].into(),
+            ..LinkMessages::default()
+        };
+        let series = LinkSeries([(CavId::new("2").unwrap(), link)].into());
+        let at = |tick| series.at(tick, None).remove(0);
+        assert_eq!((at(1).sent_bytes, at(1).transit_ms), (900, Some(300.0)));
+        assert_eq!((at(2).sent_bytes, at(2).transit_ms), (900, None));
+    }
 
     #[test]
     fn the_backlog_is_what_was_published_and_has_not_arrived() {

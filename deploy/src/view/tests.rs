@@ -463,6 +463,10 @@ fn every_ego_of_a_recorded_run_is_shown_with_its_own_results() {
         );
         assert_eq!(frame["links"][0]["from"], other_than(name));
     }
+    let poses_only = tempfile::tempdir().unwrap();
+    let poses_only = record(poses_only.path(), false);
+    let mut ticks = poses_only.timeline(None).iter();
+    assert!(ticks.all(|tick| tick.links.is_empty()));
     // Published 25 ms after the tick and recorded at 60 ms, long before the next tick.
     let links = &run.timeline(None)[2].links;
     assert_eq!(

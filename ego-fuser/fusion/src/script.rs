@@ -155,6 +155,9 @@ impl Fusion for ScriptFusion {
                 "forward returns a map of {:?}, not of {expected:?}",
                 fused.size()
             )),
+            Ok(fused) if fused.is_sparse() => {
+                Err("forward returns a sparse map, not a dense one".into())
+            }
             Ok(fused) if fused.kind() != features.kind() => Err(format!(
                 "forward returns {:?}, not {:?}",
                 fused.kind(),

@@ -5,7 +5,8 @@
 
 use std::f64::consts::TAU;
 
-use dataset::{LeftOut, LoadOptions, Scenario};
+use dataset::frame::Frame;
+use dataset::{LeftOut, LoadOptions, Scenario, ground_truth};
 use perception::detector::Detector;
 use perception::weights::Weights;
 use protocol::{PointCloud, Pose};
@@ -15,7 +16,7 @@ use serde::Serialize;
 use support::statistics;
 use tch::{Device, Kind, Tensor, no_grad};
 
-use ego_fuser::ego::{Ego, EgoError};
+use ego_fuser::ego::EgoError;
 use fusion::method::Method;
 use fusion::model::FusionStage;
 use fusion::planar_pose::moved;
@@ -76,15 +77,15 @@ impl AlignmentMeter {
         Ok(Self { detector, fusion })
     }
 
-    /// Measures on every `every`-th tick of scenarios, the first vehicle being the ego; the same directions for the
-    /// same seed. Frames that cannot be read are added to `left_out`.
+    /// Measures on every `every`-th tick of scenarios, each with its communication range, metres, the first vehicle being
+    /// the ego; the same directions for the same seed. Frames that cannot be read are added to `left_out`.
     ///
     /// # Errors
     /// [`AlignmentMeterError`] at the first frame that cannot be computed, and when the fusion has no alignment of its
     /// own.
     pub fn measure(
         &mut self,
-        scenarios: &[Scenario],
+        scenarios: &[(Scenario, f64)],
         every: usize,
         offsets: &[Offset],
         seed: u64,
@@ -92,9 +93,9 @@ impl AlignmentMeter {
     ) -> Result<Vec<AlignmentError>, AlignmentMeterError> {
         let mut errors: Vec<Vec<[[f64; 2]; 2]>> = offsets.iter().map(|_| Vec::new()).collect();
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
-        for scenario in scenarios {
+        for (scenario, comm_range_m) in scenarios {
             for tick in (0..scenario.ticks.len()).step_by(every.max(1)) {
-                for pair in self.pairs(scenario, tick, left_out)? {
+                for pair in self.pairs((scenario, *comm_range_m), tick, left_out)? {
                     // Directions come from one generator: the order of these loops is part of the result.
                     for (offset, errors) in offsets.iter().zip(&mut errors) {
                         errors.push(self.around(&pair, offset, &mut rng)?);
@@ -110,7 +111,7 @@ impl AlignmentMeter {
     /// The ego with each of its neighbours in range: two maps, and the true pose of the second.
     fn pairs(
         &mut self,
-        scenario: &Scenario,
+        (scenario, comm_range_m): (&Scenario, f64),
         tick: usize,
         left_out: &mut LeftOut,
     ) -> Result<Vec<(Tensor, Pose)>, AlignmentMeterError> {
@@ -118,25 +119,22 @@ impl AlignmentMeter {
         let loaded = scenario.load_tick(tick, agents, &LoadOptions::default());
         left_out.add_tick(&loaded);
         // Agent 0 is the ego: without its frame there is no pair.
-        let [(0, ego), others @ ..] = &loaded.frames[..] else {
+        if loaded.frames.first().is_none_or(|(agent, _)| *agent != 0) {
             return Ok(Vec::new());
-        };
-        let Some(world_from_ego) = ego.world_from_lidar else {
+        }
+        let frames: Vec<&Frame> = loaded.frames.iter().map(|(_, frame)| frame).collect();
+        let near = ground_truth::contributors(&frames, 0, comm_range_m).into_iter();
+        let mut near =
+            near.filter_map(|index| Some((frames[index], frames[index].world_from_lidar?)));
+        let Some((ego, world_from_ego)) = near.next() else {
             return Ok(Vec::new());
         };
         let own = self.map(&ego.points)?;
         let mut pairs = Vec::new();
-        for (_, frame) in others {
-            let Some(world_from_cav) = frame.world_from_lidar else {
-                continue;
-            };
-            let ego_from_cav = world_from_ego.from_world(&world_from_cav);
-            let [x, y, _] = ego_from_cav.translation_m;
-            if x.hypot(y) <= Ego::COMM_RANGE_M {
-                let maps =
-                    Tensor::f_cat(&[&own, &self.map(&frame.points)?], 0).map_err(EgoError::from)?;
-                pairs.push((maps, ego_from_cav));
-            }
+        for (frame, world_from_cav) in near {
+            let maps =
+                Tensor::f_cat(&[&own, &self.map(&frame.points)?], 0).map_err(EgoError::from)?;
+            pairs.push((maps, world_from_ego.from_world(&world_from_cav)));
         }
         Ok(pairs)
     }

@@ -26,7 +26,7 @@ use perception::inference::Inference;
 use perception::model_config::DetectorConfig;
 use perception::weights::Weights;
 use protocol::message::{Descriptor, Detections};
-use protocol::{Ledger, PoseEstimate, Stamp, Stream, Tracks};
+use protocol::{Ledger, Pose, PoseEstimate, Stamp, Stream, Tracks};
 use tch::Device;
 
 use ego_fuser::ego::Ego;
@@ -36,8 +36,8 @@ use training::feature_store::MapSource;
 pub use error::EvaluateError;
 use participant::Participant;
 pub use setup::{AgentPool, EmulatedLink, Setup};
-use stepped::{ComputeTimes, RemotePool};
-pub use sweeps::without_true_pose;
+use stepped::RemotePool;
+pub use sweeps::{add_unplaced_tick, without_true_pose};
 
 /// One frame of the ego with all data for its evaluation.
 #[derive(Debug, Clone)]
@@ -61,18 +61,18 @@ pub struct EvaluatedFrame {
 }
 
 impl EvaluatedFrame {
-    /// True if the recording has the ego's true pose. Without it nothing tells where the true boxes are: the frame counts
+    /// The ego's true pose, if the recording has it. Without it nothing tells where the true boxes are: the frame counts
     /// in no score, and [`Evaluator::left_out`] names it.
-    pub fn has_true_pose(&self) -> bool {
-        let ego = self.frames.first();
-        ego.is_some_and(|ego| ego.world_from_lidar.is_some())
+    pub fn true_pose(&self) -> Option<Pose> {
+        self.frames.first()?.world_from_lidar
     }
 }
 
 /// Evaluates scenarios one after another.
 #[derive(Debug)]
 pub struct Evaluator {
-    setup: Setup,
+    /// Its settings; of those only the compute times may change, where they are measured.
+    pub setup: Setup,
     weights: Weights,
     /// The ego's pipeline.
     pub ego: Ego,
@@ -117,11 +117,6 @@ impl Evaluator {
             left_out: LeftOut::default(),
             sent_bytes: 0,
         })
-    }
-
-    /// Sets the compute times, where they were measured.
-    pub fn set_compute(&mut self, compute: ComputeTimes) {
-        self.setup.compute = compute;
     }
 
     /// Runs the vehicles' pipelines in processes of their own from now on, or in this one. The previous processes get

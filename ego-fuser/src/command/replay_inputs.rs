@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 
 use agent::input_log::RecordedInputs;
-use anyhow::{Context, bail};
+use anyhow::Context;
 use bus::log_to_stderr;
 use protocol::message::{Detections, FrameReport};
 use protocol::{Limits, Stream, Tracks};
@@ -87,10 +87,10 @@ impl Arguments {
             };
             let decoded =
                 input.try_map(|message| message.decode(&ego_loop, &Limits::DEFAULT).map(Box::new));
-            let Ok(input) = decoded else {
+            let input = decoded.with_context(|| {
                 let file = self.file.display();
-                bail!("{file}: a recorded message cannot be decoded");
-            };
+                format!("{file}: a recorded message cannot be decoded")
+            })?;
             for output in ego_loop.handle(&mut ego, input, now_nanos) {
                 if let Output::Publish {
                     capture_nanos,

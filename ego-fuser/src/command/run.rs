@@ -4,7 +4,7 @@ use crate::config::EgoConfig;
 use crate::ego::{Ego, EgoError};
 use crate::node::{self, NodeOptions};
 use anyhow::Context;
-use bus::{Configured, STOP_LIMIT, log_to_stderr};
+use bus::{Configured, log_to_stderr};
 use protocol::{CavId, Role};
 use support::output;
 
@@ -30,9 +30,7 @@ impl Arguments {
         let bus = config.bus.join(&stop, &config.run, Role::Ego, &cav)?;
         tracing::info!(ego = %cav, method = %ego.method(), weights = %config.models.weights.display(), "ready");
         let report = node::run(&bus, &cav, ego, &NodeOptions::from(&config), &stop)?;
-        if let Err(overdue) = bus.leave(STOP_LIMIT) {
-            tracing::warn!("{overdue}");
-        }
+        bus.leave_at_end();
         if self.json {
             output::line(serde_json::to_string(&report)?)?;
         } else {
@@ -40,6 +38,8 @@ impl Arguments {
             let at_deadline = report.at_deadline;
             let failure = report.failure.as_ref();
             let reason = failure.map_or(String::new(), |reason| format!(", the first: {reason}"));
+            let other = report.other_network.as_ref();
+            let other = other.map_or(String::new(), |other| format!("; another network: {other}"));
             let boxes = match report.fused_boxes {
                 0 => String::new(),
                 boxes => format!(" ({boxes} of them boxes)"),
@@ -51,10 +51,11 @@ impl Arguments {
                 }
             };
             output::line(format_args!(
-                "{frames} frames, {fused} neighbours' messages fused{boxes}{refused}, {at_deadline} at the deadline, {failed} failed{reason}"
+                "{frames} frames, {fused} neighbours' messages fused{boxes}{refused}, {at_deadline} at the deadline, {failed} failed{reason}{other}"
             ))?;
         }
-        Ok(Outcome::of(report.failed > 0))
+        let is_lossy = report.failed > 0 || report.other_network.is_some();
+        Ok(Outcome::of(is_lossy))
     }
 }
 

@@ -13,18 +13,14 @@ use crate::pairing::Dropped;
 const MAX_AHEAD_NANOS: u64 = 2_000_000_000;
 
 /// Reason why a message is not decoded.
-#[derive(Debug)]
+#[derive(Debug, thiserror::Error)]
 pub(crate) enum Refusal {
     /// No frame will use it.
+    #[error("{0}")]
     Unneeded(DropReason),
     /// It is malformed.
-    Malformed(WireError),
-}
-
-impl From<WireError> for Refusal {
-    fn from(error: WireError) -> Self {
-        Self::Malformed(error)
-    }
+    #[error(transparent)]
+    Malformed(#[from] WireError),
 }
 
 impl EgoLoop {
@@ -92,7 +88,7 @@ impl EgoLoop {
             return self.begin(ego, message, now_nanos);
         }
         let source = (cav.clone(), message.view.content.exchange().stream());
-        self.note_stream(&cav, source.1);
+        self.published.insert(source.clone());
         // From here on the capture time is on the clock of the ego.
         match self.dated(&cav, source.1, times) {
             Ok(capture_nanos) => message.view.capture_nanos = capture_nanos,
@@ -110,13 +106,6 @@ impl EgoLoop {
         self.silence.reset(&cav);
         if let Some(lost) = self.pairing.insert(&source, capture_nanos, message) {
             self.drop_lost(lost);
-        }
-    }
-
-    /// Records that a neighbour publishes a stream.
-    fn note_stream(&mut self, cav: &CavId, stream: Stream) {
-        if stream == Stream::Boxes || stream == self.stream {
-            self.published.insert((cav.clone(), stream));
         }
     }
 
@@ -154,7 +143,7 @@ impl EgoLoop {
     /// of the ego will use it.
     fn dated(&self, cav: &CavId, stream: Stream, times: [u64; 2]) -> Result<u64, DropReason> {
         let [stated_nanos, arrived_nanos] = times;
-        if stream == self.stream && self.models.is_other(cav) {
+        if stream == self.stream && self.models.other(cav).is_some() {
             return Err(DropReason::Shape);
         }
         let corrected = self.clocks.corrected(cav, stated_nanos);
@@ -194,13 +183,15 @@ impl EgoLoop {
         self.own_nanos = Some(capture_nanos);
     }
 
-    /// Compares an agent's network with the ego's. Maps of another network are left out from then on.
+    /// Compares an agent's network with the ego's. Maps of another network are left out from then on, and frames of an own
+    /// agent with another one fail.
     pub(super) fn compare_models(&mut self, cav: &CavId, descriptor: &Descriptor) {
         // Boxes and points belong to no network.
         let sends_maps = descriptor.streams.contains(&Stream::Bev);
-        for &stream in &descriptor.streams {
-            self.note_stream(cav, stream);
-        }
+        let perception = [Stream::Boxes, self.stream].into_iter();
+        let sent = perception.filter(|stream| descriptor.streams.contains(stream));
+        let sent = sent.map(|stream| (cav.clone(), stream));
+        self.published.extend(sent);
         if self.stream != Stream::Bev || (self.reads_boxes && !sends_maps) {
             self.models.forget(cav);
             return;
@@ -208,9 +199,11 @@ impl EgoLoop {
         let Some(other) = self.models.update(cav, descriptor) else {
             return;
         };
-        if *cav == self.cav {
-            tracing::error!(%cav, "the ego's own agent runs another network than the ego: {other}");
-            return;
+        // Of a neighbour that sends boxes beside its maps, these are read.
+        let sends_boxes = descriptor.streams.contains(&Stream::Boxes);
+        if sends_maps && (*cav == self.cav || !(self.reads_boxes && sends_boxes)) {
+            let first = &mut self.report.other_network;
+            first.get_or_insert_with(|| format!("agent {cav}: {other}"));
         }
         tracing::warn!(%cav, "its maps are of another network and are left out: {other}");
         self.empty(&(cav.clone(), Stream::Bev), DropReason::Shape);

@@ -3,10 +3,11 @@
 use std::time::Duration;
 
 use protocol::message::{FusedNeighbour, NeighbourState, SkippedNeighbour, StageTiming};
+use protocol::text::{MAX_MESSAGE_BYTES, printable};
 use protocol::{Detections, DropReason, HEADER_LEN, Stream};
 
 use super::{EgoLoop, Output, OwnFrame, Source};
-use crate::ego::{Ego, View};
+use crate::ego::{Ego, EgoError, View};
 use crate::misbehaviour::Assessment;
 
 /// The neighbours' messages for a frame, and the neighbours without one.
@@ -68,7 +69,7 @@ impl EgoLoop {
     fn is_complete(&self, capture_nanos: u64) -> bool {
         self.members.iter().all(|cav| {
             let [maps, boxes] = [self.stream, Stream::Boxes].map(|stream| (cav.clone(), stream));
-            let is_other = self.models.is_other(cav);
+            let is_other = self.models.other(cav).is_some();
             // Its feature maps came before the ego's next sweep lately.
             let is_in_time = self.published.contains(&maps) && self.late_maps.is_awaited(cav);
             // Boxes end the wait for maps that are of another network, or not in time.
@@ -89,7 +90,11 @@ impl EgoLoop {
         let own = frame.view;
         let waited = Duration::from_nanos(now_nanos.saturating_sub(frame.begun_nanos));
         let mut choice = self.choose(own.capture_nanos);
-        match ego.detect(&own, &choice.views) {
+        // A map of another network on the same grid gives boxes, but not those that are there.
+        let other = self.models.other(&self.cav);
+        let other = other.map(|other| format!("own agent of another network: {other}"));
+        let error = other.map(EgoError::OwnView);
+        match error.map_or_else(|| ego.detect(&own, &choice.views), Err) {
             Ok(output) => {
                 self.report.refused_boxes += output.refused_boxes;
                 self.report.refused_velocities += output.refused_velocities;
@@ -105,7 +110,7 @@ impl EgoLoop {
                 let result = Detections {
                     ego: self.cav.clone(),
                     agent_frame: frame.agent_frame,
-                    method: ego.method().name().to_owned(),
+                    method: printable(ego.method().name(), MAX_MESSAGE_BYTES),
                     pose: own.pose,
                     detections: output.detections,
                     fused,
@@ -190,9 +195,9 @@ impl EgoLoop {
             }
             self.silence.missed(cav);
             let lost = dropped.iter().rev().find(|lost| lost.sender.0 == *cav);
-            let reason = match self.models.is_other(cav) {
-                true => Some(DropReason::Shape),
-                false => lost.map(|lost| lost.reason),
+            let reason = match self.models.other(cav) {
+                Some(_) => Some(DropReason::Shape),
+                None => lost.map(|lost| lost.reason),
             };
             let cav = cav.clone();
             choice.skipped.push(SkippedNeighbour { cav, reason });

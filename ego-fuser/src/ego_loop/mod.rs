@@ -84,6 +84,8 @@ pub struct LoopReport {
     pub failed: u64,
     /// Reason of the first of these.
     pub failure: Option<String>,
+    /// The first agent whose maps were not fused as they are of another network, and what differs.
+    pub other_network: Option<String>,
 }
 
 /// A frame that has begun.
@@ -170,8 +172,8 @@ impl EgoLoop {
         }
     }
 
-    /// Takes an input in at `now_nanos`, which does not decrease from one message or wake to the next. Only [`Input::Wake`] decides a frame, and one at most:
-    /// fusing takes time, in which more may arrive.
+    /// Takes an input in at `now_nanos`, which does not decrease from one message or wake to the next. Only
+    /// [`Input::Wake`] decides a frame, and one at most: fusing takes time, in which more may arrive.
     pub fn handle(&mut self, ego: &mut Ego, input: Input, now_nanos: u64) -> Vec<Output> {
         match input {
             Input::Message(message) => self.take_in(ego, *message, now_nanos),

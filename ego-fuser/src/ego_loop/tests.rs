@@ -55,6 +55,20 @@ impl Case {
         self.ego_loop.handle(&mut self.ego, input, NOW)
     }
 
+    /// The sender of a view names another network, and the streams that it publishes beside its pose.
+    fn describe(&mut self, view: &View, streams: &[Stream]) {
+        let detector = self.ego.detector();
+        let descriptor = Descriptor {
+            model_hash: ModelHash([7; 32]),
+            grid: detector.grid(),
+            channels: u32::try_from(detector.sent_shape()[0]).unwrap(),
+            dtype: Dtype::F32,
+            streams: (std::iter::once(Stream::Pose).chain(streams.iter().copied())).collect(),
+            sweeps: vec![],
+        };
+        self.handle(Input::Model(view.cav.clone(), descriptor));
+    }
+
     /// The same view, captured `sweeps` later, arrives.
     fn receive(&mut self, view: &View, sweeps: u64) -> Vec<Output> {
         self.receive_at(view, sweeps * PERIOD, 0)
@@ -100,15 +114,7 @@ impl Case {
 fn a_neighbour_of_another_network_counts_by_its_boxes() {
     let mut case = Case::new();
     let (own, map, boxes) = (case.own.clone(), case.map.clone(), case.boxes.clone());
-    let descriptor = Descriptor {
-        model_hash: ModelHash([7; 32]),
-        grid: case.ego.detector().grid(),
-        channels: u32::try_from(case.ego.detector().sent_shape()[0]).unwrap(),
-        dtype: Dtype::F32,
-        streams: vec![Stream::Pose, Stream::Boxes, Stream::Bev],
-        sweeps: vec![],
-    };
-    case.handle(Input::Model(map.cav.clone(), descriptor));
+    case.describe(&map, &[Stream::Boxes, Stream::Bev]);
     let refused = Case::accounts(&case.receive(&map, 0));
     assert_eq!(refused, (vec![], vec![(Stream::Bev, DropReason::Shape)]));
     case.receive(&own, 0);
@@ -123,7 +129,34 @@ fn a_neighbour_of_another_network_counts_by_its_boxes() {
     let result = result.unwrap();
     assert_eq!(result.fused[0].cav, boxes.cav);
     assert!(result.skipped.is_empty(), "{:?}", result.skipped);
-    assert_eq!(case.ego_loop.report().fused_boxes, 1);
+    let report = case.ego_loop.report();
+    assert_eq!((report.fused_boxes, &report.other_network), (1, &None));
+}
+
+#[test]
+fn an_agent_of_another_network_is_reported_and_frames_of_the_egos_own_fail() {
+    let mut case = Case::new();
+    let (own, map) = (case.own.clone(), case.map.clone());
+    let hashes = [[7; 32], case.ego.detector().model_hash().0].map(ModelHash);
+    let difference = format!("model_hash is {}, the ego's is {}", hashes[0], hashes[1]);
+    case.describe(&map, &[Stream::Bev]);
+    let reported = Some(format!("agent b: {difference}"));
+    assert_eq!(case.ego_loop.report().other_network, reported);
+
+    case.describe(&own, &[Stream::Bev]);
+    case.receive(&own, 0);
+    let outputs = case.handle(Input::Wake);
+    let [
+        Output::Counted((cav, _), Some(DropReason::Shape)),
+        Output::Failed { error, .. },
+    ] = &outputs[..]
+    else {
+        panic!("{outputs:?}");
+    };
+    assert_eq!(*cav, own.cav);
+    let error = error.to_string();
+    assert!(error.ends_with(&difference), "{error}");
+    assert_eq!(case.ego_loop.report().failed, 1);
 }
 
 #[test]

@@ -1,4 +1,4 @@
-//! Waits of an ego: missing messages and streams, and messages that all come untimely, for its status.
+//! Waits of an ego: missing messages and streams, and messages that all cannot be used, for its status.
 
 use std::collections::BTreeMap;
 
@@ -9,8 +9,8 @@ use protocol::{CavId, DropReason, Stream};
 const AFTER_NANOS: u64 = 3_000_000_000;
 /// The same for the own agent's next message while its period is not known or is long, nanoseconds.
 const LONGEST_NANOS: u64 = 30_000_000_000;
-/// Time after which messages that are all untimely are a problem, and after which they are forgotten, nanoseconds.
-const UNTIMELY_NANOS: u64 = 5_000_000_000;
+/// Time after which messages that all cannot be used are a problem, and after which they are forgotten, nanoseconds.
+const UNUSABLE_NANOS: u64 = 5_000_000_000;
 /// Largest number of vehicles of a kind.
 const MAX_VEHICLES: usize = 64;
 
@@ -28,8 +28,9 @@ pub(crate) struct Waits {
     own_message_nanos: Option<u64>,
     /// Time after which the wait for the next one is a problem, nanoseconds.
     own_after_nanos: u64,
-    /// Neighbours whose messages are all dropped for their time: time of the first and of the last of these, and reason.
-    untimely: BTreeMap<CavId, (u64, u64, DropReason)>,
+    /// Vehicles whose messages are all dropped for their time or their network: time of the first and of the last of these,
+    /// and reason.
+    unusable: BTreeMap<CavId, (u64, u64, DropReason)>,
     /// Vehicles that do not publish the stream, with those that they publish.
     without: BTreeMap<CavId, (String, u64)>,
     /// Vehicles that left without announcing their end.
@@ -46,7 +47,7 @@ impl Waits {
             own_nanos: None,
             own_message_nanos: None,
             own_after_nanos: AFTER_NANOS,
-            untimely: BTreeMap::new(),
+            unusable: BTreeMap::new(),
             without: BTreeMap::new(),
             gone: BTreeMap::new(),
         }
@@ -65,17 +66,17 @@ impl Waits {
         }
     }
 
-    /// Records that a neighbour's message was used, or why not, for [`Self::problems`].
+    /// Records that a vehicle's message was used, or why not, for [`Self::problems`].
     pub(crate) fn note(&mut self, cav: &CavId, reason: Option<DropReason>, now_nanos: u64) {
-        use DropReason::{Clock, Future, Stale};
-        let has_room = self.untimely.len() < MAX_VEHICLES;
-        let reason = reason.filter(|why| has_room && matches!(why, Clock | Future | Stale));
-        let known = self.untimely.remove(cav);
+        use DropReason::{Clock, Future, Shape, Stale};
+        let has_room = self.unusable.len() < MAX_VEHICLES;
+        let reason = reason.filter(|why| has_room && matches!(why, Clock | Future | Shape | Stale));
+        let known = self.unusable.remove(cav);
         if let Some(reason) = reason {
             let known = known.filter(|(_, last, _)| is_recent(*last, now_nanos));
             let first_nanos = known.map_or(now_nanos, |(first, ..)| first);
-            let untimely = (first_nanos, now_nanos, reason);
-            self.untimely.insert(cav.clone(), untimely);
+            let unusable = (first_nanos, now_nanos, reason);
+            self.unusable.insert(cav.clone(), unusable);
         }
     }
 
@@ -103,13 +104,13 @@ impl Waits {
     /// Records that a vehicle has left, and whether it announced its end.
     pub(super) fn left(&mut self, cav: &CavId, has_ended: bool, now_nanos: u64) {
         self.without.remove(cav);
-        self.untimely.remove(cav);
+        self.unusable.remove(cav);
         if !has_ended && self.gone.len() < MAX_VEHICLES {
             self.gone.insert(cav.clone(), now_nanos);
         }
     }
 
-    /// Waits of three seconds and more, streams that are missing, and neighbours of which no message is in time, each
+    /// Waits of three seconds and more, streams that are missing, and vehicles of which no message can be used, each
     /// with the time of its beginning, nanoseconds.
     pub(crate) fn problems(&self, now_nanos: u64) -> Vec<(String, u64)> {
         let Self { ego, stream, .. } = self;
@@ -118,10 +119,10 @@ impl Waits {
         let own_nanos = self.own_nanos.filter(|_| !self.without.contains_key(ego));
         let own_before = now_nanos.saturating_sub(self.own_after_nanos);
         let no_own = own_nanos.filter(|since| *since < own_before);
-        let untimely = self.untimely.iter().filter(|(_, (first, last, _))| {
+        let unusable = self.unusable.iter().filter(|(_, (first, last, _))| {
             is_recent(*last, now_nanos) && !is_recent(*first, *last)
         });
-        let untimely = untimely.map(|(cav, (first, _, reason))| {
+        let unusable = unusable.map(|(cav, (first, _, reason))| {
             let problem = format!("fuses no {stream} of agent {cav}, drop reason {reason}");
             (problem, *first)
         });
@@ -134,13 +135,13 @@ impl Waits {
         let gone = self.gone.iter().filter(|(_, since)| **since < late_before);
         let gone = gone.map(|(cav, since)| (format!("vehicle {cav} is gone"), *since));
         let missing = no_own.into_iter().chain(without).chain(gone);
-        missing.chain(untimely).collect()
+        missing.chain(unusable).collect()
     }
 }
 
 /// True if a message was dropped lately: successive ones are of one problem.
 fn is_recent(dropped_nanos: u64, now_nanos: u64) -> bool {
-    now_nanos.saturating_sub(dropped_nanos) < UNTIMELY_NANOS
+    now_nanos.saturating_sub(dropped_nanos) < UNUSABLE_NANOS
 }
 
 #[cfg(test)]
@@ -170,7 +171,7 @@ mod tests {
     }
 
     #[test]
-    fn a_neighbour_whose_messages_are_all_untimely_is_named() {
+    fn a_vehicle_whose_messages_are_all_unusable_is_named() {
         let [own, other] = ["1", "2"].map(|name| CavId::new(name).unwrap());
         let mut waits = Waits::new(&own, "max", Stream::Bev, true);
         let stale = Some(DropReason::Stale);
@@ -195,6 +196,12 @@ mod tests {
         assert_eq!(waits.problems(25 * SECOND).len(), 1);
         waits.left(&other, true, 25 * SECOND);
         assert_eq!(waits.problems(25 * SECOND), []);
+
+        for second in 30..=35 {
+            waits.note(&other, Some(DropReason::Shape), second * SECOND);
+        }
+        let named = "fuses no bev of agent 2, drop reason shape".to_owned();
+        assert_eq!(waits.problems(35 * SECOND), [(named, 30 * SECOND)]);
     }
 
     #[test]

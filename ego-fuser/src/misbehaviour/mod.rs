@@ -112,14 +112,8 @@ impl MisbehaviourDetector {
         self.range.widen(&mine.map);
         let mut all = Vec::with_capacity(neighbours.len());
         for (view, _) in neighbours {
-            // A map from which the head makes values or boxes of no detector is evidence against its sender only.
-            let seen = SeenMessage::in_message(&view.content, detector, &self.empty);
-            all.push(match seen {
-                Err(DetectorError::Values { .. } | DetectorError::Box(_)) => {
-                    SeenMessage::implausible()
-                }
-                seen => seen?,
-            });
+            let seen = SeenMessage::of_neighbour(&view.content, detector, &self.empty);
+            all.push(seen?);
         }
         let mut evidence = Vec::with_capacity(neighbours.len());
         for ((view, ego_from_cav), seen) in neighbours.iter().zip(&all) {
@@ -128,29 +122,9 @@ impl MisbehaviourDetector {
             let is_new = last.is_none_or(|(nanos, ..)| *nanos != view.capture_nanos);
             evidence.push(is_new.then(|| self.evidence(own, &mine, view, ego_from_cav, seen)));
         }
-        // Of two neighbours with the same message, the one with the weaker evidence otherwise is the copier; both where
-        // neither has any in its favour.
-        let log_odds = evidence.iter().map(|one| one.as_ref()?.judgement());
-        let log_odds = log_odds.map(|found| found.map_or(0.0, |(odds, _)| odds));
-        let fits: Vec<f64> = log_odds.collect();
-        for (index, evidence) in evidence.iter_mut().enumerate() {
-            let Some(evidence) = evidence else { continue };
-            let message = &all[index].fingerprint;
-            evidence.is_copied |= (0..all.len())
-                .filter(|&other| other != index && fits[other] >= fits[index])
-                .any(|other| message.is_copy_of(&all[other].fingerprint));
-        }
-        // Of a neighbour's map and boxes the worse counts, once: true boxes are no excuse for a false map.
-        let mut judgements: BTreeMap<&CavId, Option<(f64, MisbehaviourReason)>> = BTreeMap::new();
-        for ((view, _), evidence) in neighbours.iter().zip(evidence) {
-            let judgement = evidence.as_ref().and_then(Evidence::judgement);
-            tracing::debug!(cav = %view.cav, ?judgement, ?evidence, "neighbour judged");
-            let worst = judgements.entry(&view.cav).or_default();
-            let both = worst.iter().copied().chain(judgement);
-            *worst = both.min_by(|one, other| one.0.total_cmp(&other.0));
-        }
+        mark_copies(&mut evidence, &all);
         let probation = mine.is_boxes();
-        let of_cav = judgements.into_iter();
+        let of_cav = worst_of_each(neighbours, &evidence).into_iter();
         let of_cav: BTreeMap<_, _> = of_cav
             .map(|(cav, found)| (cav, self.add_up(own.capture_nanos, cav, found, probation)))
             .collect();
@@ -245,7 +219,11 @@ impl MisbehaviourDetector {
         let was_out = reputation.is_out;
         let threshold = [LEAVE_OUT_BELOW, TAKE_BACK_ABOVE][usize::from(was_out)];
         reputation.is_out = reputation.log_odds < threshold;
-        let reason = reputation.reason;
+        // Too weak to leave it out, evidence only prolongs the probation.
+        let reason = match reputation.log_odds < LEAVE_OUT_BELOW {
+            true => reputation.reason,
+            false => MisbehaviourReason::Probation,
+        };
         match (was_out, reputation.is_out) {
             (false, true) => {
                 tracing::warn!(%cav, %reason, "its messages contradict the ego's perception: left out")
@@ -260,6 +238,37 @@ impl MisbehaviourDetector {
             misbehaviour: reputation.is_out.then_some(reason),
         }
     }
+}
+
+/// Of two neighbours with the same message, the one with the weaker evidence otherwise is the copier; both where neither
+/// has any in its favour.
+fn mark_copies(evidence: &mut [Option<Evidence>], all: &[SeenMessage]) {
+    let log_odds = evidence.iter().map(|one| one.as_ref()?.judgement());
+    let log_odds = log_odds.map(|found| found.map_or(0.0, |(odds, _)| odds));
+    let fits: Vec<f64> = log_odds.collect();
+    for (index, evidence) in evidence.iter_mut().enumerate() {
+        let Some(evidence) = evidence else { continue };
+        let message = &all[index].fingerprint;
+        evidence.is_copied |= (0..all.len())
+            .filter(|&other| other != index && fits[other] >= fits[index])
+            .any(|other| message.is_copy_of(&all[other].fingerprint));
+    }
+}
+
+/// Of a neighbour's map and boxes the worse judgement, once: true boxes are no excuse for a false map.
+fn worst_of_each<'a>(
+    neighbours: &[(&'a View, Pose)],
+    evidence: &[Option<Evidence>],
+) -> BTreeMap<&'a CavId, Option<(f64, MisbehaviourReason)>> {
+    let mut judgements: BTreeMap<&CavId, Option<(f64, MisbehaviourReason)>> = BTreeMap::new();
+    for ((view, _), evidence) in neighbours.iter().zip(evidence) {
+        let judgement = evidence.as_ref().and_then(Evidence::judgement);
+        tracing::debug!(cav = %view.cav, ?judgement, ?evidence, "neighbour judged");
+        let worst = judgements.entry(&view.cav).or_default();
+        let both = worst.iter().copied().chain(judgement);
+        *worst = both.min_by(|one, other| one.0.total_cmp(&other.0));
+    }
+    judgements
 }
 
 /// Index of the last judged message of its kind.
@@ -352,6 +361,23 @@ mod tests {
                 .is_none()
         );
         assert!(trust.add_up(0, &cav, None, true).misbehaviour.is_none());
+    }
+
+    #[test]
+    fn weak_evidence_against_a_neighbour_on_probation_is_no_misbehaviour() {
+        let mut trust = trust();
+        let cav = CavId::new("a").unwrap();
+        let mut assess = |log_odds| {
+            let judgement = Some((log_odds, MisbehaviourReason::PositionMismatch));
+            trust.add_up(0, &cav, judgement, true).misbehaviour
+        };
+        assert_eq!(assess(-0.6), Some(MisbehaviourReason::Probation));
+        assert_eq!(assess(-3.0), Some(MisbehaviourReason::PositionMismatch));
+        assert_eq!(
+            assess(1.0),
+            Some(MisbehaviourReason::Probation),
+            "its average recovers"
+        );
     }
 
     #[test]

@@ -4,7 +4,7 @@ use nalgebra::Point2;
 use perception::boxes::postprocess::{PostprocessConfig, detections};
 use perception::detector::{Detector, DetectorError};
 use perception::model_config::YAxis;
-use protocol::BevGrid;
+use protocol::{BevGrid, Box3d};
 use tch::Tensor;
 
 use super::fingerprint::Fingerprint;
@@ -21,8 +21,8 @@ const REACH_M: f64 = 35.0;
 /// Content of a message.
 #[derive(Debug)]
 pub(super) struct SeenMessage {
-    /// Positions of confidently detected vehicles, metres.
-    pub(super) vehicles: Vec<Point2<f64>>,
+    /// Confidently detected vehicles.
+    pub(super) vehicles: Vec<Box3d>,
     /// Confidence of the head in a vehicle at each cell; or all boxes and their scores, where there are boxes only.
     sure: Sure,
     /// Enough values to detect a copy.
@@ -37,7 +37,7 @@ pub(super) struct SeenMessage {
 enum Sure {
     /// `None` for cells that were not sent.
     Cells(BevGrid, Vec<Option<f32>>),
-    Boxes(Vec<([f64; 2], f32)>),
+    Boxes(Vec<(Box3d, f32)>),
 }
 
 impl SeenMessage {
@@ -54,10 +54,7 @@ impl SeenMessage {
             }
             Content::Boxes(_) => {
                 let evident = content.detections().filter(|found| found.score > EVIDENT);
-                let boxes = evident.map(|found| {
-                    let [x, y, _] = found.box3d.center_m;
-                    ([x, y], found.score)
-                });
+                let boxes = evident.map(|found| (found.box3d, found.score));
                 Ok(Self::of_boxes(boxes.collect()))
             }
             Content::Points(points) => {
@@ -70,21 +67,30 @@ impl SeenMessage {
         }
     }
 
-    /// Of a map that no head can interpret.
-    pub(super) fn implausible() -> Self {
-        Self {
-            map: vec![f32::INFINITY],
-            ..Self::of_boxes(Vec::new())
+    /// [`Self::in_message`] of a neighbour: a map from which the head makes values or boxes of no detector is evidence
+    /// against its sender only.
+    pub(super) fn of_neighbour(
+        content: &Content,
+        detector: &mut Detector,
+        empty: &[f32],
+    ) -> Result<Self, DetectorError> {
+        match Self::in_message(content, detector, empty) {
+            Err(DetectorError::Values { .. } | DetectorError::Box(_)) => Ok(Self {
+                map: vec![f32::INFINITY],
+                ..Self::of_boxes(Vec::new())
+            }),
+            seen => seen,
         }
     }
 
-    pub(super) fn of_boxes(all: Vec<([f64; 2], f32)>) -> Self {
+    pub(super) fn of_boxes(all: Vec<(Box3d, f32)>) -> Self {
         let sure = all.iter().filter(|(_, score)| *score >= SURE);
-        let values = all
-            .iter()
-            .flat_map(|([x, y], score)| [*x as f32, *y as f32, *score]);
+        let values = all.iter().flat_map(|(found, score)| {
+            let [x, y, _] = found.center_m;
+            [x as f32, y as f32, *score]
+        });
         Self {
-            vehicles: sure.map(|(at_m, _)| Point2::from(*at_m)).collect(),
+            vehicles: sure.map(|(found, _)| *found).collect(),
             fingerprint: Fingerprint::of_values(values.collect()),
             sure: Sure::Boxes(all),
             is_blind: false,
@@ -112,7 +118,7 @@ impl SeenMessage {
             let [x, y, _] = detection.box3d.center_m;
             // Cells that were not sent have no features that a head can interpret.
             if cell_of(&grid, x, y).is_none_or(|cell| cells[cell].is_some()) {
-                found.push(([x, y], detection.score));
+                found.push((detection.box3d, detection.score));
             }
         }
         let values: Vec<f32> = Vec::try_from(&map.f_contiguous()?.f_view([-1])?)?;
@@ -143,13 +149,20 @@ impl SeenMessage {
             }
             Sure::Boxes(_) if at_m[0].hypot(at_m[1]) > REACH_M => None,
             Sure::Boxes(all) => {
+                let at = Point2::from(at_m);
                 let near = all
                     .iter()
-                    .filter(|([x, y], _)| (x - at_m[0]).hypot(y - at_m[1]) <= radius_m);
+                    .filter(|(found, _)| (place(found) - at).norm() <= radius_m);
                 Some(near.map(|(_, score)| *score).fold(0.0, f32::max))
             }
         }
     }
+}
+
+/// Place of a box seen from above, metres.
+pub(super) fn place(found: &Box3d) -> Point2<f64> {
+    let [x, y, _] = found.center_m;
+    Point2::new(x, y)
 }
 
 /// Confidence of each cell in the vehicle's frame, `None` where it was not sent: the rows of a mirrored network are in
@@ -191,7 +204,7 @@ fn around(grid: &BevGrid, [x, y]: [f64; 2], radius_m: f64) -> impl Iterator<Item
 mod tests {
     use perception::model_config::DetectorConfig;
     use perception::pillars::point_pillars::PointPillars;
-    use protocol::{Box3d, DecodedFeatures, Detection};
+    use protocol::{DecodedFeatures, Detection};
     use tch::nn::VarStore;
 
     use super::*;
@@ -269,12 +282,12 @@ mod tests {
             source: None,
         });
         let seen = SeenMessage::in_message(
-            &Content::Boxes(found.map(Into::into).to_vec()),
+            &Content::Boxes(found.clone().map(Into::into).to_vec()),
             &mut detector,
             &[],
         )
         .unwrap();
-        assert_eq!(seen.vehicles, [Point2::new(4.0, 0.0)]);
+        assert_eq!(seen.vehicles, [found[0].box3d]);
         assert_eq!(
             (
                 seen.sure_at([8.0, 0.0], 1.0),

@@ -271,6 +271,13 @@ impl Bus {
         topic.in_run(&self.identity.run)
     }
 
+    /// [`Self::leave`] at the end of a program, which closes a session that does not close in time.
+    pub fn leave_at_end(self) {
+        if let Err(overdue) = self.leave(shutdown::STOP_LIMIT) {
+            tracing::warn!("{overdue}");
+        }
+    }
+
     /// Publishes the final ledger and closes the session, in at most `limit`. Publishers and subscriptions have to be
     /// ended before.
     ///

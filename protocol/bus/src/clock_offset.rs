@@ -10,12 +10,20 @@ const AHEAD_S: f64 = 0.05;
 pub const NETWORK_TRANSIT_S: f64 = 0.15;
 /// Longest transit time behind a link emulation, seconds. A clock that is behind has the same effect, so that a warning
 /// is logged beyond it.
-pub const LINK_TRANSIT_S: f64 = 2.0;
+const LINK_TRANSIT_S: f64 = 2.0;
 /// A clock was set back if so many messages, over this period at least, are all slower than the estimate by more than the
 /// longest transit time, nanoseconds.
 const STEP_MESSAGES: u32 = 5;
 const STEP_PERIOD: Duration = Duration::from_secs(1);
 const STEP_NANOS: i64 = 150_000_000;
+
+/// Longest transit time of a message, seconds.
+pub fn longest_transit_s(over_link: bool) -> f64 {
+    match over_link {
+        true => LINK_TRANSIT_S,
+        false => NETWORK_TRANSIT_S,
+    }
+}
 
 /// True if the clock of a sender with this offset (its clock minus ours, seconds, minus the shortest transit time) counts
 /// as ours: a transit time of up to `longest_transit_s` looks like a clock that is behind.

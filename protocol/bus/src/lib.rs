@@ -71,7 +71,7 @@ pub mod web;
 pub use access_control::AccessControl;
 pub use args::{BusConfig, InboxConfig, log_to_stderr};
 pub use bus::{Bus, Identity};
-pub use clock_offset::{LINK_TRANSIT_S, NETWORK_TRANSIT_S, is_same_clock};
+pub use clock_offset::{NETWORK_TRANSIT_S, is_same_clock, longest_transit_s};
 pub use credentials::{
     AUTHORITY_FILE, CERTIFICATE_FILE, Credentials, KEY_FILE, MEMBERS_FILE, ROUTER,
 };

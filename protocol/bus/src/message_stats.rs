@@ -5,6 +5,7 @@ use std::fmt;
 use std::sync::{Arc, Mutex, MutexGuard};
 use std::time::{Duration, Instant};
 
+use protocol::text::{MAX_MESSAGE_BYTES, printable};
 use protocol::{
     Account, CavId, DropReason, Ledger, Limits, ProcessId, RateReason, StageSummary, Topic,
     TopicTraffic, WireError,
@@ -279,12 +280,14 @@ impl MessageStats {
         }
     }
 
-    /// Problems of the process, each with its duration.
+    /// Problems of the process, each with its duration, as a message may hold them.
     pub fn problems(&self) -> Vec<String> {
         let state = self.lock();
         let problems = state.problems.values().flatten().take(MAX_PROBLEMS);
         let texts = problems.map(|(problem, since)| {
-            format!("{problem} (for {:.0} s)", since.elapsed().as_secs_f64())
+            let duration = format!(" (for {:.0} s)", since.elapsed().as_secs_f64());
+            let room = MAX_MESSAGE_BYTES.saturating_sub(duration.len());
+            printable(problem, room) + &duration
         });
         texts.collect()
     }
@@ -465,6 +468,11 @@ mod tests {
         );
         stats.set_problems("no pose", None);
         assert_eq!(stats.problems(), ["no sweep (for 12 s)"]);
+        let long = format!("no sweep:\n{}", "x".repeat(300));
+        stats.set_problems("no sweep", [(long, since)]);
+        let problem = stats.problems().remove(0);
+        assert!(problem.starts_with("no sweep: xx") && problem.ends_with("x (for 12 s)"));
+        assert_eq!(problem.len(), MAX_MESSAGE_BYTES, "messages hold no more");
     }
 
     fn stats_of(process: &str) -> MessageStats {

@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::fs;
 use std::time::Duration;
 
+use protocol::text::{MAX_MESSAGE_BYTES, printable};
 use protocol::{ProcessUsage, ThreadUsage};
 use rustix::time::{ClockId, clock_gettime};
 
@@ -49,7 +50,7 @@ fn plain_name(name: &str) -> String {
     let name = name
         .trim_end()
         .trim_end_matches(|letter: char| letter.is_ascii_digit());
-    name.trim_end_matches('-').to_owned()
+    printable(name.trim_end_matches('-'), MAX_MESSAGE_BYTES)
 }
 
 /// A field of `/proc/PID/status` in kB, in bytes.

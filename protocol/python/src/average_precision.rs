@@ -26,10 +26,11 @@ pub(crate) fn average_precision<'py>(
         ))
     })?;
     let frames = frames(detections, truth)?;
-    let single = iou.map_or(Some(0.5), |iou| iou.extract::<f64>().ok());
-    let thresholds: Vec<f64> = match (single, iou) {
-        (None, Some(iou)) => iou.extract()?,
-        (single, _) => single.into_iter().collect(),
+    let (is_single, thresholds): (bool, Vec<f64>) = match iou {
+        None => (true, vec![0.5]),
+        // Also of one threshold, which NumPy would take for a number.
+        Some(several) if several.len().is_ok() => (false, several.extract()?),
+        Some(single) => (true, vec![single.extract()?]),
     };
     if let Some(bad) = thresholds.iter().find(|iou| !(**iou > 0.0 && **iou <= 1.0)) {
         return Err(error(format!(
@@ -39,18 +40,35 @@ pub(crate) fn average_precision<'py>(
     // Without the lock of Python: nothing here is a Python object, and the matching takes time.
     let found = py.detach(|| {
         let mut scorer = Scorer::new(&thresholds);
-        for (detections, truth) in &frames {
-            scorer.add(detections, truth);
+        for (detections, truth) in ranked(frames) {
+            scorer.add(&detections, &truth);
         }
         scorer.average_precisions(ordering)
     });
-    match (single, found.first()) {
-        (Some(_), Some(found)) => Ok(found.into_pyobject(py)?.into_any()),
+    match (is_single, found.first()) {
+        (true, Some(found)) => Ok(found.into_pyobject(py)?.into_any()),
         _ => Ok(thresholds.iter().zip(found).into_py_dict(py)?.into_any()),
     }
 }
 
-type ScoredFrame = (Vec<Detection>, GroundTruth);
+type ScoredFrame = (Vec<(Box3d, f64)>, GroundTruth);
+
+/// The frames with the ranks of the scores in their place: average precision depends on the order alone, and single
+/// precision would take close scores for equal ones.
+fn ranked(frames: Vec<ScoredFrame>) -> impl Iterator<Item = (Vec<Detection>, GroundTruth)> {
+    let scores = frames.iter().flat_map(|(found, _)| found);
+    let mut scores: Vec<f64> = scores.map(|(_, score)| *score).collect();
+    scores.sort_by(f64::total_cmp);
+    scores.dedup();
+    let detection = move |(box3d, score): (Box3d, f64)| Detection {
+        box3d,
+        score: scores.partition_point(|known| *known < score) as f32,
+        source: None,
+    };
+    frames
+        .into_iter()
+        .map(move |(found, truth)| (found.into_iter().map(&detection).collect(), truth))
+}
 
 /// Detections and ground truth of each frame.
 fn frames(detections: &Bound<'_, PyAny>, truth: &Bound<'_, PyAny>) -> PyResult<Vec<ScoredFrame>> {
@@ -75,7 +93,7 @@ fn entries<'py>(name: &str, frames: &Bound<'py, PyAny>) -> PyResult<Vec<Bound<'p
     frames.collect()
 }
 
-fn scored_boxes(frame: usize, found: &Bound<'_, PyAny>) -> PyResult<Vec<Detection>> {
+fn scored_boxes(frame: usize, found: &Bound<'_, PyAny>) -> PyResult<Vec<(Box3d, f64)>> {
     let py = found.py();
     let (boxes, scores) = match found.cast::<PyDetections>() {
         Ok(found) => {
@@ -93,8 +111,8 @@ fn scored_boxes(frame: usize, found: &Bound<'_, PyAny>) -> PyResult<Vec<Detectio
         })?,
     };
     let boxes = boxes_of("detections", frame, &boxes)?;
-    let scores = as_array::<f32>(&scores)?;
-    let scores: Vec<f32> = scores.as_array().iter().copied().collect();
+    let scores = as_array(&scores)?;
+    let scores: Vec<f64> = scores.as_array().iter().copied().collect();
     if scores.len() != boxes.len() {
         let (found, expected) = (scores.len(), boxes.len());
         return Err(error(format!(
@@ -104,13 +122,7 @@ fn scored_boxes(frame: usize, found: &Bound<'_, PyAny>) -> PyResult<Vec<Detectio
     if let Some(bad) = scores.iter().find(|score| !score.is_finite()) {
         return Err(error(format!("detections of frame {frame}: score {bad}")));
     }
-    let scored = boxes.into_iter().zip(scores);
-    let detections = scored.map(|(box3d, score)| Detection {
-        box3d,
-        score,
-        source: None,
-    });
-    Ok(detections.collect())
+    Ok(boxes.into_iter().zip(scores).collect())
 }
 
 /// Ground truth of a frame; of arrays and annotations all boxes count, and all detections.
@@ -132,7 +144,7 @@ fn ground_truth(frame: usize, objects: &Bound<'_, PyAny>) -> PyResult<GroundTrut
 
 /// Rows of an array `[N, 7]`; an empty list is none.
 fn boxes_of(what: &str, frame: usize, boxes: &Bound<'_, PyAny>) -> PyResult<Vec<Box3d>> {
-    let boxes = as_array::<f64>(boxes)?;
+    let boxes = as_array(boxes)?;
     let shape = boxes.shape().to_vec();
     if shape != [boxes.len() / 7, 7] && !boxes.is_empty() {
         return Err(error(format!(
@@ -144,25 +156,31 @@ fn boxes_of(what: &str, frame: usize, boxes: &Bound<'_, PyAny>) -> PyResult<Vec<
     if let Some(bad) = values.iter().find(|value| !value.is_finite()) {
         return Err(error(format!("{what} of frame {frame}: a box with {bad}")));
     }
-    let rows = values.as_chunks::<7>().0.iter();
-    let boxes = rows.map(|&[x, y, z, dx, dy, dz, heading_rad]| Box3d {
-        center_m: [x, y, z],
-        size_m: [dx, dy, dz],
-        heading_rad,
+    let rows = values.as_chunks::<7>().0.iter().enumerate();
+    let boxes = rows.map(|(index, &[x, y, z, dx, dy, dz, heading_rad])| {
+        let size_m = [dx, dy, dz];
+        if size_m.iter().any(|size| *size < 0.0) {
+            return Err(error(format!(
+                "{what} of frame {frame}: box {index} of size {size_m:?} m, expected 0 or more"
+            )));
+        }
+        Ok(Box3d {
+            center_m: [x, y, z],
+            size_m,
+            heading_rad,
+        })
     });
-    Ok(boxes.collect())
+    boxes.collect()
 }
 
-/// The array that NumPy makes of a list, or of an array of another type.
-fn as_array<'py, T: numpy::Element>(
-    value: &Bound<'py, PyAny>,
-) -> PyResult<PyReadonlyArrayDyn<'py, T>> {
+/// The array of numbers that NumPy makes of a list, or of an array of another type.
+fn as_array<'py>(value: &Bound<'py, PyAny>) -> PyResult<PyReadonlyArrayDyn<'py, f64>> {
     let py = value.py();
     let made = py
         .import("numpy")?
-        .call_method1("asarray", (value, T::get_dtype(py)))?;
+        .call_method1("asarray", (value, numpy::dtype::<f64>(py)))?;
     let array = made
-        .cast_into::<PyArrayDyn<T>>()
+        .cast_into::<PyArrayDyn<f64>>()
         .map_err(|cause| error(cause.to_string()))?;
     Ok(numpy::PyArrayMethods::readonly(&array))
 }

@@ -32,6 +32,8 @@ pub(crate) struct DataSet {
     /// Number of frames.
     count: usize,
     options: LoadOptions,
+    /// Name of the protocol that was asked for; `None`: that of the layout, or of the recorded run.
+    asked: Option<String>,
     protocol: EvaluationProtocol,
     source: FrameSet,
 }
@@ -60,27 +62,16 @@ impl DataSet {
             let agents = self.agents.get(&scenario.name);
             parts.ego = agents.and_then(|agents| agents.first().cloned());
             parts.scenario = Some(Arc::clone(scenario));
-            let unreadable = loaded.unreadable.into_iter();
-            parts
-                .problems
-                .extend(unreadable.map(|(_, problem)| problem.message));
+            let problems = &mut parts.problems;
+            problems.extend(loaded.unreadable.into_iter().map(|(_, one)| one.message));
             for (_, frame) in loaded.frames {
-                let problems = frame.problems.iter();
-                parts
-                    .problems
-                    .extend(problems.map(|problem| problem.message.clone()));
+                problems.extend(frame.problems.iter().map(|one| one.message.clone()));
                 let agent = AgentParts::recorded(frame, self.options.points);
                 parts.agents.push(agent);
             }
             return Some(parts);
         }
         None
-    }
-
-    fn frame(&self, py: Python<'_>, index: usize) -> PyResult<Option<FleetFrame>> {
-        py.detach(|| self.load(index))
-            .map(|parts| FleetFrame::new(py, parts))
-            .transpose()
     }
 }
 
@@ -94,9 +85,10 @@ impl DataSet {
         let count = self.count;
         let counted_from = if index < 0 { count } else { 0 };
         let wanted = counted_from.checked_add_signed(index);
-        let frame = wanted.map(|index| self.frame(py, index)).transpose()?;
-        let frame = frame.flatten();
-        frame.ok_or_else(|| PyIndexError::new_err(format!("frame {index} of {count}")))
+        let parts = wanted.and_then(|index| py.detach(|| self.load(index)));
+        let parts =
+            parts.ok_or_else(|| PyIndexError::new_err(format!("frame {index} of {count}")))?;
+        FleetFrame::new(py, parts)
     }
 
     fn __iter__<'py>(slf: &Bound<'py, Self>) -> PyResult<Bound<'py, PyAny>> {
@@ -110,7 +102,13 @@ impl DataSet {
         let (path, options) = (self.path.clone(), &self.options);
         Ok((
             py.import("v2vloc")?.getattr("read")?,
-            (path, options.points, options.radar, options.cameras),
+            (
+                path,
+                options.points,
+                options.radar,
+                options.cameras,
+                self.asked.clone(),
+            ),
         ))
     }
 
@@ -122,18 +120,21 @@ impl DataSet {
     }
 }
 
-type ReadArguments = (PathBuf, bool, bool, bool);
+type ReadArguments = (PathBuf, bool, bool, bool, Option<String>);
 
 /// Opens a data set, or a recording of a run.
 #[pyfunction]
-#[pyo3(signature = (path, points=true, radar=false, cameras=false))]
+#[pyo3(signature = (path, points=true, radar=false, cameras=false, protocol=None))]
 pub(crate) fn read(
     py: Python<'_>,
     path: PathBuf,
     points: bool,
     radar: bool,
     cameras: bool,
+    protocol: Option<String>,
 ) -> PyResult<DataSet> {
+    // Frames are read later, when the program may be in another folder. An empty path has no absolute one.
+    let path = std::path::absolute(&path).unwrap_or(path);
     let options = LoadOptions {
         points,
         radar,
@@ -141,7 +142,10 @@ pub(crate) fn read(
         ..LoadOptions::default()
     };
     py.detach(|| -> PyResult<DataSet> {
-        let protocols = ProtocolConfig::default();
+        let protocols = ProtocolConfig {
+            preset: protocol.clone(),
+            ..ProtocolConfig::default()
+        };
         let of_recording = protocols.resolve(Layout::RECORDING).map_err(error)?;
         let recording =
             dataset::recording_of(&path).map(|file| RecordingFrames::open(&file, &options));
@@ -154,13 +158,22 @@ pub(crate) fn read(
                 problems: recording.problems.clone(),
                 count: recording.frames.len(),
                 options,
-                protocol: recording.protocol.clone().unwrap_or(of_recording),
+                protocol: { recording.protocol.clone() }
+                    .filter(|_| protocol.is_none())
+                    .unwrap_or(of_recording),
+                asked: protocol,
                 source: FrameSet::Recording(Box::new(recording)),
             });
         }
         // A recording that cannot be read gives the same error here.
-        let dataset = dataset::open(&path).map_err(error)?;
+        let mut dataset = dataset::open(&path).map_err(error)?;
+        let asked = protocol;
         let protocol = protocols.resolve(dataset.layout).map_err(error)?;
+        if asked.is_some() {
+            // As in an evaluation, the frames are those of the protocol's ego.
+            let arranged = protocols.arrange_all(&path, &dataset, None);
+            dataset.scenarios = arranged.map_err(error)?.1;
+        }
         let scenarios = &dataset.scenarios;
         let arranged = { scenarios.iter() }.filter_map(|scenario| protocol.arrange(scenario));
         let agents = arranged.map(|one| {
@@ -175,6 +188,7 @@ pub(crate) fn read(
             problems: dataset.problems.iter().map(ToString::to_string).collect(),
             count: scenarios.iter().map(|one| one.ticks.len()).sum(),
             options,
+            asked,
             protocol,
             source: FrameSet::Folder(dataset.scenarios.into_iter().map(Arc::new).collect()),
         })

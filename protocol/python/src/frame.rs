@@ -146,13 +146,25 @@ impl FleetFrame {
         })
     }
 
-    /// The agents that take part by a protocol, the ego first; of a run all.
-    fn participants(&self, protocol: &EvaluationProtocol) -> Vec<CavId> {
-        let Some(scenario) = &self.scenario else {
-            return self.truth.iter().map(|agent| agent.cav.clone()).collect();
+    /// The agents that take part by a protocol, the ego first; of a run all. An ego that is not `named` must have the
+    /// frames of the scenario: an evaluation by the protocol is over those of its ego.
+    fn participants(&self, protocol: &EvaluationProtocol, named: bool) -> PyResult<Vec<CavId>> {
+        let Some(scenario) = self.scenario.as_deref() else {
+            return Ok(self.truth.iter().map(|agent| agent.cav.clone()).collect());
         };
-        let arranged = protocol.arrange(scenario);
-        arranged.map_or_else(Vec::new, |arranged| arranged.agents)
+        let Some(arranged) = protocol.arrange(scenario) else {
+            return Ok(Vec::new());
+        };
+        if !named && arranged.ticks != scenario.ticks {
+            let [ego, other] = [&arranged, scenario].map(|one| one.agents.first());
+            let [ego, other] = [ego, other].map(|ego| ego.map_or("", CavId::as_str));
+            let (name, scenario) = (&protocol.name, &scenario.name);
+            return Err(error(format!(
+                "protocol {name}: its ego is {ego} and has other frames than {other} in scenario {scenario}: \
+                 read(path, protocol={name:?})"
+            )));
+        }
+        Ok(arranged.agents)
     }
 
     /// The frames of these agents in their order, then that of an ego that is named and not among them.
@@ -187,7 +199,7 @@ impl FleetFrame {
             intervals("area_m", area_m).map_err(error)?;
         }
         let rule = area_m.map_or(protocol.ground_truth, |area_m| protocol.rule_within(area_m));
-        let agents = self.participants(&protocol);
+        let agents = self.participants(&protocol, ego.is_some())?;
         let default = match self.scenario {
             // The ego of a data set follows from the protocol.
             Some(_) => agents.first().map(ToString::to_string),

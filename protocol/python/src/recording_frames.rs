@@ -1,16 +1,12 @@
 //! Frames of a recording: its messages by capture time, in any order of access.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::fs::File;
-use std::io::{self, BufReader};
 use std::path::Path;
 
 use dataset::LoadOptions;
-use dataset::evaluation_protocol::EvaluationProtocol;
+use dataset::evaluation_protocol::{EvaluationProtocol, ScoredRun};
 use protocol::{Kind, Stream, Topic};
 use recording::{Entry, Recording};
-use serde::Deserialize;
-use serde_json::Value;
 
 use crate::frame_parts::{FrameParts, is_part_of_frames};
 
@@ -52,11 +48,11 @@ impl RecordingFrames {
         let run = first.map_or_else(String::new, |entry| entry.key.run.to_string());
         let damage = recording.damage().iter().map(ToString::to_string);
         let mut problems: Vec<String> = damage.collect();
-        let scores = scores_beside(path);
-        let (protocol, ego) = scores.unwrap_or_else(|cause| {
+        let scores = ScoredRun::beside(path).unwrap_or_else(|cause| {
             problems.push(format!("scores beside {}: {cause}", path.display()));
-            (None, None)
+            ScoredRun::default()
         });
+        let ego = scores.ego.map(|ego| ego.to_string());
         let scored = ego.filter(|ego| egos.contains(ego));
         if scored.is_none() && egos.len() > 1 {
             problems.push(format!("results of {egos:?}: Frame.ego is the first"));
@@ -65,7 +61,7 @@ impl RecordingFrames {
             recording,
             run,
             frames: frames.into_iter().collect(),
-            protocol,
+            protocol: scores.protocol,
             ego: scored.or_else(|| egos.pop_first()),
             problems,
         })
@@ -89,26 +85,6 @@ impl RecordingFrames {
         }
         Some(parts)
     }
-}
-
-/// Protocol, with the ground-truth range as it was applied, and ego by which a recorded run was scored: they are in the
-/// files beside its recording.
-fn scores_beside(path: &Path) -> io::Result<(Option<EvaluationProtocol>, Option<String>)> {
-    let metrics = first_value(&path.with_file_name("metrics.json"))?;
-    let result = first_value(&path.with_file_name("detections.jsonl"))?;
-    let protocol = Option::deserialize(&metrics["protocol"])?;
-    Ok((protocol, Option::deserialize(&result["ego"])?))
-}
-
-/// The first JSON value of a file; null if there is no such file.
-fn first_value(path: &Path) -> io::Result<Value> {
-    let file = match File::open(path) {
-        Err(cause) if cause.kind() == io::ErrorKind::NotFound => return Ok(Value::Null),
-        opened => BufReader::new(opened?),
-    };
-    let values = serde_json::Deserializer::from_reader(file);
-    let first = values.into_iter().next().transpose()?;
-    Ok(first.unwrap_or_default())
 }
 
 fn is_wanted(topic: &Topic, options: &LoadOptions) -> bool {

@@ -19,6 +19,9 @@ def test_small_cases(run):
     for frames, truth in (([(CAR, [0.9])], [[]]), ([], [])):
         assert v2vloc.average_precision(frames, truth) is None
         assert v2vloc.average_precision(frames, truth, iou=[0.5, 0.7]) == {0.5: None, 0.7: None}
+    assert v2vloc.average_precision([(CAR, [0.9])], [CAR], iou=np.array([0.5])) == {0.5: 1.0}
+    close = (np.concatenate([FAR, CAR]), [0.5, 0.5 + 1e-9])
+    assert v2vloc.average_precision([close], [CAR]) == 1.0
     frames = [(FAR, [0.2]), (CAR, [0.9])]
     assert v2vloc.average_precision(frames, [[], CAR]) == 1.0
     assert v2vloc.average_precision(frames, [[], CAR], ordering="frame") == 0.5
@@ -54,6 +57,7 @@ def test_wrong_arrays_are_named(run):
         (([(CAR, [0.9, 0.8])], [CAR]), {}, "2 scores for 1 boxes"),
         (([(CAR, [np.nan])], [CAR]), {}, "score NaN"),
         (([(CAR, [0.9])], [CAR * np.inf]), {}, "truth of frame 0: a box with inf"),
+        (([(CAR * [1, 1, 1, -1, 1, 1, 1], [0.9])], [CAR]), {}, "detections of frame 0: box 0 of size [-4.5, 1.9, 1.6] m"),
         (([CAR], [CAR]), {}, "expected Detections or (boxes, scores)"),
         (([], []), {"iou": 0}, "iou: 0, expected more than 0"),
         (([], []), {"ordering": "score"}, "ordering: \"score\""),

@@ -1,5 +1,6 @@
 """Data sets on disk and recordings."""
 import json
+import os
 import pickle
 import shutil
 
@@ -50,6 +51,29 @@ def test_agents_that_do_not_take_part_annotate_nothing(run):
     refuses(lambda: frame.ground_truth(protocol="v2xreal-i2i"), "no true pose of agent \"\"")
     alone = frame.ground_truth(frame.ego, protocol="v2xreal-i2i")
     assert 0 < len(alone) and set(alone.ids) <= set(frame.agents[frame.ego].objects.ids), alone
+
+
+def test_frames_are_those_of_the_ego_of_the_protocol(run):
+    root = run.work / "gaps"
+    for cav, stems in (("1", range(3)), ("-1", range(1, 4))):
+        (root / cav).mkdir(parents=True)
+        for stem in stems:
+            (root / cav / f"{stem:06}.yaml").write_text("lidar_pose: [0, 0, 2, 0, 0, 0]\nvehicles: {}\n")
+            (root / cav / f"{stem:06}.pcd").write_text("")
+    by_layout = v2vloc.read(root, points=False)
+    by_units = v2vloc.read(root, points=False, protocol="v2xreal-i2i")
+    assert [frame.ego for frame in by_units] == ["-1"] * 3 and by_layout[0].ego == "1"
+    assert by_units[0].capture_time_ns > by_layout[0].capture_time_ns
+    refuses(lambda: by_layout[0].ground_truth(protocol="v2xreal-i2i"), "read(path, protocol=\"v2xreal-i2i\")")
+    assert len(pickle.loads(pickle.dumps(by_units))[0].ground_truth()) == 0
+
+
+def test_a_set_of_a_relative_path_is_read_from_any_folder(run):
+    here = os.getcwd()
+    os.chdir(run.scene.parent)
+    scene = v2vloc.read(run.scene.name, points=False)
+    os.chdir(here)
+    assert scene[0].agents and not scene[0].problems
 
 
 def test_what_is_no_area_is_refused(run):

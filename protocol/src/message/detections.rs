@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::{
-    PoseEstimate, StageTiming, check_count, check_detection, check_name, check_nanos, check_within,
+    PoseEstimate, StageTiming, check_count, check_detection, check_nanos, check_text, check_within,
     metadata_only,
 };
 use crate::{CavId, Detection, DropReason, Limits, MisbehaviourReason, WireError};
@@ -91,7 +91,7 @@ impl NeighbourState {
 
 impl Detections {
     fn check_values(&self, limits: &Limits) -> Result<(), WireError> {
-        check_name("method", &self.method)?;
+        check_text("method", &self.method)?;
         self.pose.check_values(limits)?;
         check_count("detections", self.detections.len(), limits.max_boxes)?;
         self.detections.iter().try_for_each(check_detection)?;

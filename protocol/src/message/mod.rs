@@ -24,6 +24,7 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 
 use crate::checks::{check_limit, check_within};
+use crate::text::MAX_MESSAGE_BYTES;
 use crate::{Body, BodyShape, Limits, Pose, Result, WireError};
 
 pub use bev::Bev;
@@ -106,9 +107,11 @@ fn check_pose(what: &'static str, pose: &Pose) -> Result<()> {
         .map_err(|source| WireError::Pose { what, source })
 }
 
-/// Checks names in metadata: stages, classes.
-fn check_name(what: &'static str, name: &str) -> Result<()> {
-    check_count(what, name.len(), 64)
+/// Checks texts in metadata: names of stages and classes, problems. They reach the terminals of others.
+fn check_text(what: &'static str, text: &str) -> Result<()> {
+    check_count(what, text.len(), MAX_MESSAGE_BYTES)?;
+    let control = text.chars().filter(|letter| letter.is_control());
+    check_count("control characters of a text", control.count(), 0)
 }
 
 fn wrong_body(expected: u64, body: &Body) -> WireError {

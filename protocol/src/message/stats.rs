@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{check_count, check_name, check_nanos, check_within, metadata_only};
+use super::{check_count, check_nanos, check_text, check_within, metadata_only};
 use crate::{Ledger, Limits, ProcessId, Topic, WireError};
 
 /// Largest CPU time of a process that a receiver accepts, seconds: a thousand cores for a year.
@@ -21,7 +21,8 @@ pub struct Stats {
     pub usage: ProcessUsage,
     /// Published bytes, by topic.
     pub traffic: Vec<TopicTraffic>,
-    /// Problems: reasons why the process cannot work, each with its duration: `no pose (for 12 s)`.
+    /// Problems: reasons why the process cannot work, each with its duration: `no pose (for 12 s)`. At most 256 bytes
+    /// each, without control characters, as all texts of messages.
     pub problems: Vec<String>,
 }
 
@@ -41,7 +42,7 @@ pub struct ProcessUsage {
 /// CPU time of the threads of a name.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct ThreadUsage {
-    /// Name of the threads, without a number at its end, at most 64 bytes.
+    /// Name of the threads, without a number at its end, at most 256 bytes.
     pub name: String,
     /// User and system time, seconds.
     pub cpu_s: f64,
@@ -61,7 +62,7 @@ pub struct TopicTraffic {
 /// Duration of one stage for one frame.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct StageTiming {
-    /// Name of the stage, at most 64 bytes.
+    /// Name of the stage, at most 256 bytes.
     pub stage: String,
     /// Duration, nanoseconds.
     pub nanos: u64,
@@ -70,7 +71,7 @@ pub struct StageTiming {
 /// Duration of one stage over many frames.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct StageSummary {
-    /// Name of the stage, at most 64 bytes.
+    /// Name of the stage, at most 256 bytes.
     pub stage: String,
     /// Number of frames.
     pub count: u64,
@@ -98,7 +99,7 @@ impl StageTiming {
     pub(super) fn check_all(stages: &[Self], limits: &Limits) -> Result<(), WireError> {
         check_count("stages", stages.len(), limits.max_entries)?;
         stages.iter().try_for_each(|timing| {
-            check_name("stage", &timing.stage)?;
+            check_text("stage", &timing.stage)?;
             check_nanos("stage nanos", timing.nanos)
         })
     }
@@ -111,13 +112,15 @@ impl Stats {
         check_count("topics", self.traffic.len(), limits.max_entries)?;
         check_count("problems", self.problems.len(), limits.max_entries)?;
         check_count("threads", self.usage.threads.len(), limits.max_entries)?;
+        let mut problems = self.problems.iter();
+        problems.try_for_each(|problem| check_text("problem", problem))?;
         check_within("cpu_s", self.usage.cpu_s, 0.0, MAX_CPU_S)?;
         for thread in &self.usage.threads {
-            check_name("thread", &thread.name)?;
+            check_text("thread", &thread.name)?;
             check_within("thread cpu_s", thread.cpu_s, 0.0, MAX_CPU_S)?;
         }
         for summary in &self.stages {
-            check_name("stage", &summary.stage)?;
+            check_text("stage", &summary.stage)?;
             check_within("stage sum_ms", summary.sum_ms, 0.0, MAX_CPU_S * 1e3)?;
             for time_ms in [
                 summary.p50_ms,
@@ -133,3 +136,51 @@ impl Stats {
 }
 
 metadata_only!(Stats, Stats);
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{CavId, Stamp, wire};
+
+    fn encoded(problem: &str, thread: &str) -> Result<(), String> {
+        let threads = vec![ThreadUsage {
+            name: thread.into(),
+            cpu_s: 0.0,
+        }];
+        let stats = Stats {
+            process: ProcessId::new("agent-1").unwrap(),
+            ledger: Ledger::default(),
+            stages: Vec::new(),
+            usage: ProcessUsage {
+                threads,
+                ..ProcessUsage::default()
+            },
+            traffic: Vec::new(),
+            problems: vec![problem.into()],
+        };
+        let stamp = Stamp {
+            cav: CavId::new("1").unwrap(),
+            epoch: 1,
+            sequence: 0,
+            capture_nanos: 0,
+            publish_nanos: 0,
+        };
+        let encoded = wire::encode(&stamp, stats);
+        encoded.map(drop).map_err(|error| error.to_string())
+    }
+
+    #[test]
+    fn texts_that_would_forge_lines_of_a_terminal_or_fill_it_are_refused() {
+        assert_eq!(encoded("no pose – 3 points (for 12 s)", "rx"), Ok(()));
+        assert_eq!(encoded(&"p".repeat(256), &"t".repeat(256)), Ok(()));
+        let found = encoded(&"p".repeat(257), "rx").unwrap_err();
+        assert_eq!(found, "problem: 257, at most 256 are permitted");
+        for text in ["\x1b[2J", "ready\nagent-2", "\u{9b}2J"] {
+            for found in [encoded(text, "rx"), encoded("late", text)] {
+                let found = found.unwrap_err();
+                let expected = "control characters of a text: 1, at most 0 are permitted";
+                assert_eq!(found, expected, "{text:?}");
+            }
+        }
+    }
+}

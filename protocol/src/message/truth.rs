@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{check_count, check_name, check_pose, check_within, metadata_only};
+use super::{check_count, check_pose, check_text, check_within, metadata_only};
 use crate::{Box3d, CavId, Limits, Pose, WireError};
 
 /// Ground truth of one tick: replay to scorer, on a key of its own, so that no pipeline can use it by accident.
@@ -67,7 +67,7 @@ impl TrueObject {
     }
 
     fn check_values(&self) -> Result<(), WireError> {
-        check_name("class", &self.class)?;
+        check_text("class", &self.class)?;
         check_pose("world_from_object", &self.world_from_object)?;
         // Data sets have objects without length, width or height: one of them must not reject the whole message.
         self.box3d().check_from(0.0)?;

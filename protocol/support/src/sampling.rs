@@ -19,9 +19,22 @@ pub fn distinct<T: PartialEq>(items: impl IntoIterator<Item = T>) -> Vec<T> {
     kept
 }
 
+/// The first item that equals one before it.
+pub fn repeated<T: PartialEq>(items: &[T]) -> Option<&T> {
+    let mut places = items.iter().enumerate();
+    let found = places.find(|(place, item)| items.iter().take(*place).any(|one| one == *item));
+    found.map(|(_, item)| item)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn an_item_is_repeated_where_it_stands_a_second_time() {
+        assert_eq!(repeated(&[3, 1, 2, 1, 3]), Some(&1));
+        assert_eq!(repeated(&[3, 1, 2]), None);
+    }
 
     #[test]
     fn distinct_items_stay_in_their_order() {

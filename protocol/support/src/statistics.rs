@@ -1,5 +1,14 @@
 //! Mean and quantiles of samples: the only definition of a percentile in reports.
 
+/// Error of a position below which localization, or an alignment, counts as a success, metres: the limit of the papers.
+pub const SUCCESS_M: f64 = 3.0;
+
+/// Share of `tried` attempts with an error below `limit`: those without an error failed. 0 of none.
+pub fn share_below(errors: &[f64], limit: f64, tried: usize) -> f64 {
+    let near = errors.iter().filter(|error| **error < limit);
+    near.count() as f64 / tried.max(1) as f64
+}
+
 /// The mean; `None` for an empty sample.
 pub fn mean(values: &[f64]) -> Option<f64> {
     (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
@@ -62,6 +71,13 @@ mod tests {
             (quantile(&[], 0.5), mean(&[]), mean(&four)),
             (None, None, Some(2.5))
         );
+    }
+
+    #[test]
+    fn an_error_at_the_limit_and_an_attempt_without_one_are_no_success() {
+        let errors = [0.5, SUCCESS_M, f64::NAN, f64::INFINITY];
+        assert_eq!(share_below(&errors, SUCCESS_M, 5), 0.2);
+        assert_eq!(share_below(&[], SUCCESS_M, 0), 0.0);
     }
 
     #[test]

@@ -12,6 +12,14 @@ pub fn bar(total: usize, unit: &str) -> ProgressBar {
     styled(ProgressBar::new(total as u64), &template)
 }
 
+/// Shows the number done and that of all on a bar.
+pub fn shown_on(bar: &ProgressBar) -> impl Fn(usize, usize) {
+    move |done, all| {
+        bar.set_length(all as u64);
+        bar.set_position(done as u64);
+    }
+}
+
 /// A bar over 1000 steps for each of `count` parts, which displays per cent.
 pub fn percent_bar(count: usize) -> ProgressBar {
     let template = "{bar:30} {percent} %  {elapsed}, {eta} left  {msg}";

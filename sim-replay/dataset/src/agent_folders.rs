@@ -11,6 +11,7 @@ use super::frame_files::{AgentFolder, BIN, PCD, holds_pairs, yaml_ending};
 use super::keys::{self, Keys};
 use super::points::{SweepStorage, Sweeps};
 use super::problem::listed;
+use super::time_stamps;
 use super::yaml::{self, Value, YamlField};
 use super::{MissingFrame, OpenOptions, ReadError, Result, Tick, files};
 use crate::error::shown;
@@ -70,17 +71,20 @@ pub(super) fn is_agent(dir: &Path) -> bool {
     files::list(dir).is_ok_and(|listing| is_agent_folder(dir, &listing))
 }
 
-/// True for names that are CARLA actor ids (negative for roadside units) if there is any frame; for other names if
-/// there is a complete frame and no folder below has one: a scenario may hold a stray folder.
+/// True for names that are CARLA actor ids (negative for roadside units) if there is a complete frame, or a part of one
+/// and no frame in a folder below; for other names if there is a complete frame and no folder below has one: a scenario
+/// may hold a stray folder.
 fn is_agent_folder(dir: &Path, listing: &Listing) -> bool {
-    if is_number(&files::last_name(dir)) {
-        let mut names = listing.files.iter();
-        return yaml_ending(listing).is_some() || names.any(|name| name.ends_with(PCD));
-    }
+    let (mut folders, mut names) = (listing.folders.iter(), listing.files.iter());
+    let is_frame = holds_frame(listing);
+    let is_named = match is_number(&files::last_name(dir)) {
+        true if is_frame => return true,
+        true => yaml_ending(listing).is_some() || names.any(|name| name.ends_with(PCD)),
+        false => is_frame,
+    };
     // In this order: the second test lists every folder below.
-    let mut folders = listing.folders.iter().map(|folder| dir.join(folder));
-    holds_frame(listing)
-        && !folders.any(|folder| files::list(&folder).is_ok_and(|below| holds_frame(&below)))
+    let list = |folder: &String| files::list(&dir.join(folder));
+    is_named && !folders.any(|folder| list(folder).is_ok_and(|below| holds_frame(&below)))
 }
 
 /// True if there is a complete frame.
@@ -148,8 +152,8 @@ impl ScenarioFolder {
         }
         // No unit is the ego if there is a vehicle; OpenCOOD moves the first of them only. Text order, as OpenCOOD
         // sorts: `1045` before `650`.
-        let (roadside_units, vehicles): (Vec<CavId>, Vec<CavId>) =
-            (by_agent.keys().cloned()).partition(|id| is_roadside_unit(dir, id, &by_agent));
+        let (roadside_units, vehicles): (Vec<CavId>, Vec<CavId>) = (by_agent.keys().cloned())
+            .partition(|id| is_roadside_unit(dir, id, &by_agent, problems));
         let agents = [vehicles, roadside_units.clone()].concat();
         let all: BTreeSet<&String> = by_agent.values().flat_map(|agent| &agent.stems).collect();
         let mut missing = Vec::new();
@@ -211,9 +215,9 @@ impl ScenarioFolder {
         sweeps
     }
 
-    /// Capture times of all stems. Stems that are times give them, from the first on. Others count simulator ticks: if
-    /// `data_protocol.yaml` gives the length of a tick, time is tick times length; else the median step between stems is
-    /// one `period_nanos`, from 0 on.
+    /// Capture times of all stems. They count simulator ticks where `data_protocol.yaml` gives the length of a tick: time
+    /// is tick times length. Else stems that are times give them, from the first on; of others the median step is one
+    /// `period_nanos`, from 0 on. Times that no LiDAR has are a problem, and so are equal ones.
     pub(super) fn ticks(&self, period_nanos: u64, problems: &mut Vec<ReadError>) -> Vec<Tick> {
         let tick_nanos = self.tick_nanos().unwrap_or_else(|error| {
             problems.push(error);
@@ -221,11 +225,15 @@ impl ScenarioFolder {
         });
         let mut stems: Vec<&str> = self.stems.iter().map(String::as_str).collect();
         problems.extend(self.leave_unlike_out(&mut stems));
-        let keys = Keys::of_stems(&stems);
+        let counted = tick_nanos.and_then(|nanos| Keys::of_ticks(&stems, nanos));
+        let keys = counted.unwrap_or_else(|| Keys::of_stems(&stems));
         let numbers = match &keys {
             Keys::Times(nanos) => nanos.clone(),
             _ => (0..stems.len()).map(|index| keys.count(index)).collect(),
         };
+        if matches!(keys, Keys::Times(_)) {
+            problems.extend(time_stamps::step_problem(&self.dir, &numbers));
+        }
         let first = numbers.iter().min().copied().unwrap_or(0);
         let frames: Vec<(&str, u64)> = stems.into_iter().zip(numbers).collect();
         let (first, step, nanos) = match (&keys, tick_nanos) {
@@ -240,6 +248,12 @@ impl ScenarioFolder {
         let mut ticks: Vec<Tick> = ticks.collect();
         // Natural order compares fractions as whole numbers: 1.5 would come before 1.25.
         ticks.sort_by_key(|tick| tick.capture_nanos);
+        let mut pairs = ticks.array_windows::<2>();
+        let equal = pairs.find(|[a, b]| a.capture_nanos == b.capture_nanos);
+        problems.extend(equal.map(|[Tick { stem, .. }, next]| {
+            let reason = format!("frames {stem} and {} have one time", next.stem);
+            ReadError::malformed(&self.dir, reason)
+        }));
         ticks
     }
 
@@ -329,14 +343,24 @@ fn without_common_frame(
     problems.collect()
 }
 
-/// True for a negative id, and for an agent whose first frame says so: `RSU: true`.
-fn is_roadside_unit(dir: &Path, id: &CavId, by_agent: &BTreeMap<CavId, AgentFolder>) -> bool {
-    let stated = || {
+/// True for a negative id, and for an agent whose first frame says so: `RSU: true`. Another value than a boolean is a
+/// problem.
+fn is_roadside_unit(
+    dir: &Path,
+    id: &CavId,
+    by_agent: &BTreeMap<CavId, AgentFolder>,
+    problems: &mut Vec<ReadError>,
+) -> bool {
+    let mut stated = || {
         let contents = by_agent.get(id)?;
         let name = format!("{}{}", contents.stems.first()?, contents.yaml_ending?);
         let path = dir.join(id.as_str()).join(name);
         let node = yaml::read(&path).ok()?;
         let stated = YamlField::root(&path, &node).optional("RSU").ok()??;
+        if !matches!(stated.node.value, Value::Bool(_)) {
+            let fault = stated.expected("true or false");
+            problems.push(fault.with_consequence("the agent counts as a vehicle"));
+        }
         Some(stated.node.value == Value::Bool(true))
     };
     id.as_str().starts_with('-') || stated() == Some(true)
@@ -399,6 +423,47 @@ mod tests {
         assert_eq!(scenario_names(root, "test/a"), ["test/a"]);
         assert!(scenario_names(root, "empty").is_empty());
         assert!(is_agent(&dir.path().join("test/a/1")) && !is_agent(&dir.path().join("test/a")));
+    }
+
+    #[test]
+    fn a_numbered_scenario_with_its_settings_is_no_agent() {
+        let dir = tempfile::tempdir().unwrap();
+        touch(
+            dir.path(),
+            &[
+                "test/17/data_protocol.yaml",
+                "test/17/1/0.yaml",
+                "test/17/1/0.pcd",
+            ],
+        );
+        touch(
+            dir.path(),
+            &["test/18/notes.yaml", "test/18/1/0.yaml", "test/18/1/0.pcd"],
+        );
+        let names = scenario_names(dir.path(), "");
+        assert_eq!(names, ["test/17", "test/18"]);
+    }
+
+    #[test]
+    fn a_unit_is_stated_by_true_or_false() {
+        for (value, units, named) in [
+            ("true", 1, 0),
+            ("1", 0, 1),
+            ("'true'", 0, 1),
+            ("false", 0, 0),
+        ] {
+            let dir = tempfile::tempdir().unwrap();
+            touch(dir.path(), &["1/0.yaml", "1/0.pcd"]);
+            fs::write(dir.path().join("1/0.yaml"), format!("RSU: {value}\n")).unwrap();
+            let (folder, problems) = scan(dir.path());
+            let found = (folder.roadside_units.len(), problems.len());
+            assert_eq!(found, (units, named), "{value}: {problems:?}");
+            let reason = "expected true or false: the agent counts as a vehicle";
+            assert!(
+                problems.iter().all(|problem| problem.ends_with(reason)),
+                "{problems:?}"
+            );
+        }
     }
 
     #[test]
@@ -540,6 +605,67 @@ mod tests {
             assert_eq!(times.collect::<Vec<u64>>(), expected, "{stems:?}");
             let found: Vec<&str> = ticks.iter().map(|tick| tick.stem.as_str()).collect();
             assert_eq!((found, problems.len()), (stems.to_vec(), 0));
+        }
+    }
+
+    #[test]
+    fn a_stated_tick_counts_stems_of_any_size_that_are_no_times() {
+        for (stems, tick_s, expected) in [
+            (
+                ["132603000010", "132603000011", "132603000013"],
+                "0.01",
+                [0, 10, 30],
+            ),
+            (
+                ["1600000000000000", "1600000000100000", "1600000000200000"],
+                "0.05",
+                [0, 100, 200],
+            ),
+        ] {
+            let dir = tempfile::tempdir().unwrap();
+            for stem in stems {
+                touch(
+                    dir.path(),
+                    &[&format!("1/{stem}.yaml"), &format!("1/{stem}.pcd")],
+                );
+            }
+            let protocol = format!("world: {{fixed_delta_seconds: {tick_s}}}");
+            fs::write(dir.path().join("data_protocol.yaml"), protocol).unwrap();
+            let mut problems = Vec::new();
+            let ticks = scan(dir.path()).0.ticks(100_000_000, &mut problems);
+            let first = ticks[0].capture_nanos;
+            let times = ticks
+                .iter()
+                .map(|tick| (tick.capture_nanos - first) / 1_000_000);
+            assert_eq!(times.collect::<Vec<u64>>(), expected, "{stems:?}");
+            assert_eq!(problems.len(), 0, "{problems:?}");
+        }
+    }
+
+    #[test]
+    fn equal_times_and_times_that_no_lidar_has_are_named() {
+        for (stems, expected) in [
+            (
+                ["1000.5", "1000.50"],
+                "frames 1000.5 and 1000.50 have one time",
+            ),
+            (["26520600060", "26520600062"], "their unit is doubtful"),
+        ] {
+            let dir = tempfile::tempdir().unwrap();
+            for stem in stems {
+                touch(
+                    dir.path(),
+                    &[&format!("1/{stem}.yaml"), &format!("1/{stem}.pcd")],
+                );
+            }
+            let mut problems = Vec::new();
+            scan(dir.path()).0.ticks(100_000_000, &mut problems);
+            assert_eq!(problems.len(), 1, "{problems:?}");
+            assert!(
+                problems[0].to_string().ends_with(expected),
+                "{}",
+                problems[0]
+            );
         }
     }
 

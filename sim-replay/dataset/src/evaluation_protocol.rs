@@ -5,16 +5,20 @@
 //! [`EvaluationProtocol::preset`] gives those of the supported data sets; [`ProtocolConfig`] is the same as options,
 //! with single changes on top.
 
+mod arranged;
 mod config;
 mod preset;
+mod scored_run;
 
 use std::fmt;
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
+pub use arranged::{fewer, lacking};
 pub use config::{ProtocolConfig, intervals};
 pub use preset::PRESETS;
+pub use scored_run::ScoredRun;
 
 use crate::Scenario;
 use crate::ground_truth::GroundTruthRule;

@@ -118,6 +118,9 @@ pub struct Frame {
     pub yaw_rate_rad_s: Option<f64>,
     /// Objects in this CAV's annotation. A CAV never lists itself.
     pub objects: Vec<Object>,
+    /// Number of annotated objects within 20 m that no point of the sweep hits and `objects` lacks for that reason, where
+    /// the lists of agents are made from all annotations.
+    pub missed_objects: usize,
     /// All objects that the agents of the tick together are expected to find, if the data set has such a list; it is
     /// stored in the ego's frame. `None` if the lists of the agents are merged.
     pub cooperative_objects: Option<Vec<Object>>,
@@ -161,6 +164,7 @@ impl Frame {
             speed_mps: None,
             yaw_rate_rad_s: None,
             objects: Vec::new(),
+            missed_objects: 0,
             cooperative_objects: None,
             problems: Vec::new(),
             source_handedness,

@@ -6,8 +6,8 @@ use std::path::Path;
 use super::files::{self, Listing};
 use super::{ReadError, camera_files};
 
-/// Text in the names of YAML files that are no frames (OpenCOOD, V2V4Real).
-const NOT_FRAMES: [&str; 2] = ["additional", "camera_gt"];
+/// Text in the names of YAML files that are no frames (OpenCOOD, V2V4Real, the settings of a scenario).
+const NOT_FRAMES: [&str; 3] = ["additional", "camera_gt", "data_protocol"];
 /// Endings of YAML files; a folder's files have the first of these that any of them has.
 const YAMLS: [&str; 4] = [".yaml", ".yml", ".YAML", ".YML"];
 pub(super) const RADAR: &str = "radar";

@@ -35,7 +35,8 @@ pub struct GroundTruth {
     /// Objects that an ego is expected to find.
     #[serde(rename = "boxes")]
     pub objects: Vec<TrueBox>,
-    /// Objects of classes that do not count. A detection on one of them is neither right nor wrong.
+    /// Objects of classes that do not count, of which no agent's annotation makes them one that does. A detection on one
+    /// of them is neither right nor wrong.
     pub ignored: Vec<TrueBox>,
     /// Range of the objects: x, y of the lower, then of the upper corner, metres. Detections with a corner beyond it do
     /// not count.
@@ -49,15 +50,17 @@ impl GroundTruth {
         let ego = frames_of_tick.get(ego_index);
         let pose = ego.and_then(|ego| ego.world_from_lidar);
         let ([x_low, x_high], [y_low, y_high]) = (rule.x_m, rule.y_m);
+        let objects = true_boxes(&merged_objects(frames_of_tick, ego_index, rule));
+        let counted: HashSet<i64> = objects.iter().map(|object| object.id).collect();
         // Without the test of the range: an object at its border still excuses a detection.
         let ignored = select(
             frames_of_tick,
             (ego_index, rule.comm_range_m),
-            |class| !rule.classes.contains(class),
+            |object| !rule.classes.contains(object.class) && !counted.contains(&object.id),
             |_| true,
         );
         Self {
-            objects: true_boxes(&merged_objects(frames_of_tick, ego_index, rule)),
+            objects,
             ignored: true_boxes(&ignored),
             area_m: match pose {
                 Some(_) => [x_low, y_low, x_high, y_high],
@@ -168,16 +171,16 @@ pub fn merged_objects<'a>(
     select(
         frames_of_tick,
         (ego_index, rule.comm_range_m),
-        |class| rule.classes.contains(class),
+        |object| rule.classes.contains(object.class),
         |box3d| rule.keeps(box3d),
     )
 }
 
-/// The objects of some classes that agents in range annotate, with the boxes that are kept; the first of each id.
+/// Some of the objects that agents in range annotate, with the boxes that are kept; the first of each id.
 fn select<'a>(
     frames_of_tick: &[&'a Frame],
     (ego_index, comm_range_m): (usize, f64),
-    is_of_class: impl Fn(ObjectClass) -> bool,
+    is_asked_for: impl Fn(&Object) -> bool,
     is_kept: impl Fn(&Box3d) -> bool,
 ) -> Vec<(&'a Object, Box3d)> {
     let ego = frames_of_tick.get(ego_index);
@@ -195,7 +198,7 @@ fn select<'a>(
     let mut merged = Vec::new();
     for index in contributors {
         let listed = annotations.get(index).copied().unwrap_or_default();
-        for object in listed.iter().filter(|object| is_of_class(object.class)) {
+        for object in listed.iter().filter(|object| is_asked_for(object)) {
             let box3d = upright_box(object, &ego_from_world);
             // In this order: a box that is not kept leaves its id to the annotation of another agent.
             if is_kept(&box3d) && seen.insert(object.id) {
@@ -239,8 +242,7 @@ pub fn contributors(frames_of_tick: &[&Frame], ego_index: usize, comm_range_m: f
         let Some(other) = frame.world_from_lidar.filter(|_| index != ego_index) else {
             continue;
         };
-        let ([x, y, _], [ego_x, ego_y, _]) = (other.translation_m, ego.translation_m);
-        if (x - ego_x).hypot(y - ego_y) <= comm_range_m {
+        if ego.planar_distance_m(&other) <= comm_range_m {
             agents.push(index);
         }
     }

@@ -13,6 +13,8 @@ const LEAST_WHOLE_TIME: f64 = 1e8;
 pub(super) const LEAST_PER_STRAY: usize = 10;
 /// Least distance of a stray from the median, in ranges of the other numbers. Times from a start are nearer.
 const LEAST_STRAY_RANGES: f64 = 10.0;
+/// The year 2286 in nanoseconds since 1970: no capture time is later.
+const LATEST_NANOS: u64 = 10_000_000_000_000_000_000;
 /// Digits of nanoseconds.
 const NANOS_DIGITS: usize = 9;
 
@@ -33,6 +35,13 @@ impl Keys {
     pub(super) fn of_stems(stems: &[&str]) -> Self {
         let keys = numbered(stems).and_then(|numbered| Self::of_numbered(&numbered));
         keys.unwrap_or_else(|| Self::Names(stems.iter().map(|&stem| stem.to_owned()).collect()))
+    }
+
+    /// Counts of ticks of a stated length, nanoseconds, however large. `None` where the names are more or less than a
+    /// number, and for times since an epoch, which would lie beyond all years.
+    pub(super) fn of_ticks(stems: &[&str], tick_nanos: u64) -> Option<Self> {
+        let is_time = |ticks: &u64| ticks.saturating_mul(tick_nanos) < LATEST_NANOS;
+        parsed(&whole_words(stems)?, is_time).map(Self::Numbers)
     }
 
     fn of_numbered(numbered: &[Numbered<'_>]) -> Option<Self> {
@@ -151,10 +160,7 @@ fn parsed<T: FromStr>(words: &[&str], is_valid: impl Fn(&T) -> bool) -> Option<V
 /// The few stems with a time where the median is a number, or the other way round: one alone would decide what all are.
 /// `None` without any.
 pub(super) fn strays<'a>(stems: &[&'a str]) -> Option<Vec<&'a str>> {
-    let are_whole = |names: &Vec<Numbered<'_>>| names.iter().all(|name| name.seconds.is_none());
-    let names = numbered(stems).filter(are_whole)?;
-    let words: Vec<&str> = names.iter().map(|name| name.number).collect();
-    let numbers = numbers(&words)?;
+    let numbers = numbers(&whole_words(stems)?)?;
     let median = statistics::median(&numbers)?;
     let is_time = |number: f64| number >= LEAST_WHOLE_TIME;
     let (others, usual): (Vec<_>, Vec<_>) =
@@ -165,6 +171,13 @@ pub(super) fn strays<'a>(stems: &[&'a str]) -> Option<Vec<&'a str>> {
     let are_few = !others.is_empty() && others.len() * LEAST_PER_STRAY <= stems.len();
     (are_few && distances.all(|distance| distance > LEAST_STRAY_RANGES * range))
         .then(|| others.iter().map(|(stem, _)| **stem).collect())
+}
+
+/// The numbers in names that are no seconds with nanoseconds after them.
+fn whole_words<'a>(stems: &[&'a str]) -> Option<Vec<&'a str>> {
+    let names = numbered(stems)?.into_iter();
+    let words = names.map(|name| name.seconds.is_none().then_some(name.number));
+    words.collect()
 }
 
 /// The numbers of names; `None` for names that differ in more than a number.

@@ -7,12 +7,16 @@ use serde::{Deserialize, Serialize};
 
 use super::problem::reasons;
 use super::{LoadedTick, Problem, findings};
+use crate::average_precision::Scorer;
 use crate::frame::Frame;
 use support::cli::Outcome;
 use support::output;
 
 /// Largest number of findings kept; further ones are only counted.
 const KEPT: usize = 1000;
+/// Objects of which a network that works at all finds one: one with a recall of 5 % misses all so many in one of 60
+/// evaluations.
+const MISSED_OBJECTS: usize = 80;
 
 /// Data left out while the frames of a data set were used.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -79,6 +83,17 @@ impl LeftOut {
             message: format!("{frame}: {reason}"),
             ..Problem::default()
         }]);
+    }
+
+    /// Adds a failure where all frames of a method together have no detection, though there are many objects.
+    pub fn add_scores(&mut self, method: &str, scorer: &Scorer) {
+        let found_none = scorer.tallies.iter().filter(|all| all.matched.is_empty());
+        if let Some(objects) = found_none.map(|all| all.objects).max()
+            && objects >= MISSED_OBJECTS
+        {
+            let reason = format!("no detection of {objects} objects: are these weights sound?");
+            self.add_failed(&format!("method {method}, all frames"), &reason);
+        }
     }
 
     /// Adds the parts left out of a frame.
@@ -157,9 +172,10 @@ impl fmt::Display for LeftOut {
 
 #[cfg(test)]
 mod tests {
-    use protocol::{CavId, Handedness};
+    use protocol::{Box3d, CavId, Detection, Handedness};
 
     use super::*;
+    use crate::ground_truth::GroundTruth;
 
     fn problem(name: &str) -> Problem {
         Problem {
@@ -208,6 +224,40 @@ mod tests {
         let expected = "left out: 1 ticks (the ego's frame cannot be used), 1 frames of other agents that cannot be read, \
                         2 objects or other parts of frames; absent agents: 2 frames";
         assert_eq!(left_out.to_string(), expected);
+    }
+
+    #[test]
+    fn a_method_without_a_detection_is_a_failure_where_there_are_many_objects() {
+        let box3d = |x_m: f64| Box3d {
+            center_m: [x_m, 0.0, 0.0],
+            size_m: [4.0, 2.0, 1.5],
+            heading_rad: 0.0,
+        };
+        let far = Detection {
+            box3d: box3d(-90.0),
+            score: 0.5,
+            source: None,
+        };
+        for (objects, detections, expected) in [
+            (79, vec![], None),
+            (
+                80,
+                vec![],
+                Some(
+                    "method max, all frames: no detection of 80 objects: are these weights sound?",
+                ),
+            ),
+            (80, vec![far], None),
+        ] {
+            let mut scorer = Scorer::default();
+            let boxes = (0..objects).map(|place| box3d(10.0 * f64::from(place)));
+            scorer.add(&detections, &GroundTruth::of_boxes(boxes));
+            let mut left_out = LeftOut::default();
+            left_out.add_scores("max", &scorer);
+            let found = left_out.problems().next();
+            assert_eq!(found.map(|problem| problem.message.as_str()), expected);
+            assert_eq!(left_out.is_nothing(), expected.is_none());
+        }
     }
 
     #[test]

@@ -60,6 +60,7 @@ mod opv2v;
 mod opv2v_family;
 pub mod overlap;
 pub mod pcd;
+mod period;
 mod ply;
 mod points;
 mod poses;
@@ -95,6 +96,7 @@ pub use left_out::LeftOut;
 pub use listing::{content_sha256, provenance, scenario_sha256};
 pub use open::{open, open_with};
 pub use options::OpenOptions;
+pub use period::period_nanos;
 pub use points::{IntensityOption, IntensityScale, LiveIntensities, Plausibility};
 pub use presence::LoadedTick;
 pub use problem::{Problem, reasons};
@@ -177,8 +179,8 @@ pub struct Scenario {
     pub source_handedness: Handedness,
     /// Lists of files that were joined, and by which property: clouds with poses, scans with times.
     pub joins: Vec<String>,
-    /// Agents whose recorded motion contradicts their recorded poses: it is not used.
-    contradicted: BTreeSet<CavId>,
+    /// Agents whose recorded speed, and whose yaw rate, contradicts their recorded poses: it is not used.
+    contradicted: [BTreeSet<CavId>; 2],
     /// Pairs of agent and tick, by their indices, that have no frame.
     absent_at: Arc<HashSet<(usize, usize)>>,
     /// Capture times at which any agent has a frame, in order; none if they are the ticks.
@@ -273,7 +275,7 @@ impl Scenario {
             layout,
             source_handedness: Handedness::Right,
             joins: Vec::new(),
-            contradicted: BTreeSet::new(),
+            contradicted: [BTreeSet::new(), BTreeSet::new()],
             absent_at: Arc::default(),
             moments: None,
             source,
@@ -293,9 +295,9 @@ impl Scenario {
     ) -> Result<Frame> {
         let (agent, tick) = self.frame_of(agent_index, tick_index)?;
         let mut frame = self.source.frame(agent, tick)?;
-        if self.contradicted.contains(agent) {
-            (frame.speed_mps, frame.yaw_rate_rad_s) = (None, None);
-        }
+        let [speed, yaw_rate] = self.contradicted.each_ref().map(|of| of.contains(agent));
+        frame.speed_mps = frame.speed_mps.filter(|_| !speed);
+        frame.yaw_rate_rad_s = frame.yaw_rate_rad_s.filter(|_| !yaw_rate);
         if options.points {
             let variant = options.lidar_variant.as_deref();
             let cloud = self.load_points(agent_index, tick_index, variant)?;

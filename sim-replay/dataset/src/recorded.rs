@@ -5,15 +5,17 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use protocol::{
-    CavId, EgoMotion, Gnss, GnssSource, Handedness, Lidar, Limits, Payload, Radar, Role, Stream,
-    Topic, Truth, wire,
+    CavId, EgoMotion, Gnss, Handedness, Lidar, Limits, Payload, Radar, Role, Stream, Topic, Truth,
+    wire,
 };
 
 use super::layout::{LayoutReader, LayoutRow};
 use super::{
     Dataset, FrameSource, Layout, MissingFrame, OpenOptions, ReadError, Result, Scenario, Tick,
+    reasons,
 };
-use crate::frame::{Frame, Object};
+use crate::faults::Faults;
+use crate::frame::Frame;
 use crate::pcd::{IntensityKind, IntensityOrigin, PcdCloud};
 use recording::{Entry, Recording, RecordingError};
 
@@ -81,42 +83,79 @@ struct Recorded {
     truth: BTreeMap<u64, Truth>,
 }
 
+/// The first of the messages of a replay at each capture time, by topic. The others are faults.
+fn firsts_of<'a>(
+    recording: &'a Recording,
+    problems: &mut Vec<ReadError>,
+) -> BTreeMap<(u64, &'a Topic), &'a Entry> {
+    let mut firsts = BTreeMap::new();
+    let [mut misplaced, mut repeated] = [(); 2].map(|()| Faults::default());
+    for entry in recording.entries() {
+        let (topic, stamp) = (&entry.key.topic, &entry.header.stamp);
+        let fault = |what: &str| {
+            let reason = format!("{} at {} ns: {what}", entry.key, stamp.capture_nanos);
+            ReadError::malformed(recording.path(), reason)
+        };
+        let is_stated = match topic {
+            // A replay sends the data of the sensors, and previews of the sweeps.
+            Topic::Stream { cav, stream }
+                if stream.sender() == Role::Replay && *stream != Stream::Preview =>
+            {
+                if stamp.cav != *cav {
+                    misplaced.push(fault(&format!("its header names {}", stamp.cav)));
+                    continue;
+                }
+                // A person may state a pose beside the recorded one.
+                *stream == Stream::Gnss
+            }
+            Topic::Truth => false,
+            _ => continue,
+        };
+        let first: &mut &Entry = firsts.entry((stamp.capture_nanos, topic)).or_insert(entry);
+        // In the same epoch it is the same replay: a repeated message, and nothing to report.
+        if !is_stated && first.header.stamp.epoch != stamp.epoch {
+            repeated.push(fault("published by a second replay"));
+        }
+    }
+    misplaced.report("message", problems);
+    repeated.report("message", problems);
+    firsts
+}
+
+/// Steps of the ego within which an agent has sweeps before it counts as not synchronised: while the ego is away, all
+/// are within one, and losses alone spare every common tick hardly ever.
+const MIN_STEPS: usize = 3;
+
+/// Smallest distance of sweeps from the ticks around them, nanoseconds; `None` where one is at a tick, or too few are
+/// between ticks.
+fn off_nanos(ticks: &[u64], sweeps: &[u64]) -> Option<u64> {
+    let (mut steps, mut least) = (BTreeSet::new(), u64::MAX);
+    for at in sweeps {
+        let next = ticks.binary_search(at).err()?;
+        let before = ticks.get(next.wrapping_sub(1));
+        if let Some((before, after)) = before.zip(ticks.get(next)) {
+            steps.insert(next);
+            least = least.min(at - before).min(after - at);
+        }
+    }
+    (steps.len() >= MIN_STEPS).then_some(least)
+}
+
 impl Recorded {
     /// An unreadable ground truth is a problem of its tick, and not of the scene. Of two replays of one tick the first
     /// is used, sweeps and ground truth alike.
     fn new(recording: Recording, problems: &mut Vec<ReadError>) -> Result<Self> {
-        let mut sensors = BTreeMap::new();
-        let (mut truth, mut first_epochs, mut duplicates) = (BTreeMap::new(), BTreeMap::new(), 0);
-        for entry in recording.entries() {
-            let stamp = &entry.header.stamp;
-            let (capture_nanos, epoch) = (stamp.capture_nanos, stamp.epoch);
-            match &entry.key.topic {
-                // A replay sends the data of the sensors, and previews of the sweeps.
-                Topic::Stream { cav, stream }
-                    if stream.sender() == Role::Replay && *stream != Stream::Preview =>
-                {
-                    let key = (capture_nanos, cav.clone(), *stream);
-                    sensors.entry(key).or_insert_with(|| entry.clone());
-                }
-                Topic::Truth => match first_epochs.get(&capture_nanos) {
-                    // In the same epoch it is the same replay: a repeated message, and nothing to report.
-                    Some(first) => duplicates += u64::from(*first != epoch),
-                    None => {
-                        first_epochs.insert(capture_nanos, epoch);
-                        match message::<Truth>(&recording, entry) {
-                            Ok(message) => drop(truth.insert(capture_nanos, message)),
-                            Err(problem) => problems.push(problem),
-                        }
-                    }
-                },
-                _ => {}
+        let firsts = firsts_of(&recording, problems);
+        let (mut sensors, mut truth) = (BTreeMap::new(), BTreeMap::new());
+        for ((capture_nanos, topic), entry) in firsts {
+            if let Topic::Stream { cav, stream } = topic {
+                sensors.insert((capture_nanos, cav.clone(), *stream), entry.clone());
+                continue;
             }
-        }
-        if duplicates > 0 {
-            let reason = format!(
-                "more than one replay published the ground truth of {duplicates} ticks: the first is used"
-            );
-            problems.push(ReadError::malformed(recording.path(), reason));
+            match message::<Truth>(&recording, entry) {
+                Ok(message) => drop(truth.insert(capture_nanos, message)),
+                Err(problem) => problems.push(problem),
+            }
         }
         let mut recorded = Self {
             recording,
@@ -125,14 +164,31 @@ impl Recorded {
             truth,
         };
         recorded.agents = recorded.in_order();
+        let path = recorded.recording.path();
+        let apart = recorded.unsynchronised().into_iter();
+        problems.extend(apart.map(|reason| ReadError::malformed(path, reason)));
         if recorded.agents.is_empty() {
             let reason = match recorded.recording.entries() {
                 [] => "none of its messages can be read: it is of another version of this program",
                 _ => "no sweep of any vehicle in it: recorded --without lidar?",
             };
-            return Err(ReadError::malformed(recorded.recording.path(), reason));
+            let reason = format!("{reason}{}", reasons(problems.iter()));
+            return Err(ReadError::malformed(path, reason));
         }
         Ok(recorded)
+    }
+
+    /// Agents whose sweeps are between those of the ego, and never with one: they take part in no tick.
+    fn unsynchronised(&self) -> Vec<String> {
+        let Some((ego, others)) = self.agents.split_first() else {
+            return Vec::new();
+        };
+        let ticks = self.captures(ego);
+        let named = others.iter().filter_map(|cav| {
+            let off_ms = off_nanos(&ticks, &self.captures(cav))? as f64 / 1e6;
+            Some(format!("{cav} has sweeps {off_ms} ms and more off every sweep of {ego}: it takes part in no tick"))
+        });
+        named.collect()
     }
 
     /// All agents with sweeps, in the order of the scene, which is that of the ground truth: the ego comes first.
@@ -142,14 +198,18 @@ impl Recorded {
         let unlisted = self.sensors.keys().map(|(_, cav, _)| cav);
         let mut agents: Vec<CavId> = Vec::new();
         for cav in listed.chain(unlisted) {
-            let mut streams = self.sensors.keys();
-            if !agents.contains(cav)
-                && streams.any(|(_, known, stream)| known == cav && *stream == Stream::Lidar)
-            {
+            if !agents.contains(cav) && !self.captures(cav).is_empty() {
                 agents.push(cav.clone());
             }
         }
         agents
+    }
+
+    /// The capture times of the sweeps of an agent, in order.
+    fn captures(&self, agent: &CavId) -> Vec<u64> {
+        let keys = self.sensors.keys();
+        let sweeps = keys.filter(|(_, cav, stream)| cav == agent && *stream == Stream::Lidar);
+        sweeps.map(|(at, _, _)| *at).collect()
     }
 
     /// The capture times of all sweeps, and the sweeps that agents lack at them.
@@ -197,19 +257,16 @@ impl Recorded {
 
 impl FrameSource for Recorded {
     fn frame(&self, agent: &CavId, tick: &Tick) -> Result<Frame> {
-        let mut frame = Frame::empty(agent.clone(), tick.capture_nanos, Handedness::Right);
         let truth = self.truth.get(&tick.capture_nanos);
         let mut truths = truth.into_iter().flat_map(|truth| &truth.agents);
-        if let Some(truth) = truths.find(|known| known.cav == *agent) {
-            frame.world_from_lidar = Some(truth.world_from_lidar);
-            frame.objects = truth.objects.iter().map(Object::from).collect();
-        }
-        if self.has(agent, tick.capture_nanos, Stream::Gnss) {
+        let truth = truths.find(|known| known.cav == *agent);
+        let without = || Frame::empty(agent.clone(), 0, Handedness::Right);
+        let mut frame = truth.map_or_else(without, Frame::of_truth);
+        frame.capture_nanos = tick.capture_nanos;
+        // A receiver errs, and a person states roughly: where there is a ground truth, they are none at a tick without it.
+        if self.truth.is_empty() && self.has(agent, tick.capture_nanos, Stream::Gnss) {
             let gnss: Gnss = self.sensor(agent, tick, Stream::Gnss)?;
-            // A receiver errs, and a person states roughly: beside the truth they are no ground truth.
-            if gnss.source == GnssSource::Recorded || frame.world_from_lidar.is_none() {
-                frame.world_from_lidar = Some(gnss.world_from_lidar);
-            }
+            frame.world_from_lidar = Some(gnss.world_from_lidar);
         }
         if self.has(agent, tick.capture_nanos, Stream::Imu) {
             let motion: EgoMotion = self.sensor(agent, tick, Stream::Imu)?;

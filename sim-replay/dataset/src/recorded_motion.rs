@@ -32,8 +32,8 @@ struct Means {
     of_poses: f64,
 }
 
-/// Compares all agents. The recorded motion of an agent whose poses contradict it is not used from here on, and a
-/// problem of the data set names both values.
+/// Compares all agents. A recorded speed or yaw rate of an agent whose poses contradict it is not used from here on, and
+/// a problem of the data set names both values.
 pub(super) fn check(dataset: &mut Dataset) {
     let scenarios = dataset.scenarios.par_iter_mut();
     let problems: Vec<ReadError> = scenarios.flat_map_iter(check_scenario).collect();
@@ -47,24 +47,24 @@ fn check_scenario(scenario: &mut Scenario) -> Vec<ReadError> {
             .into_iter()
             .filter_map(|ticks| means(scenario, agent, ticks))
             .unzip();
-        let mut quantities = [
+        let path = scenario.points_path(agent, 0, None).unwrap_or_default();
+        let quantities = [
             ("speed", "m/s", SPEED_LIMITS, speeds),
             ("yaw rate", "degrees/s", YAW_RATE_LIMITS, yaw_rates),
         ]
         .into_iter()
-        .zip(LEAST_STRETCHES);
-        let contradiction = quantities.find_map(|((quantity, unit, limits, means), least)| {
+        .zip(LEAST_STRETCHES)
+        .zip(&mut scenario.contradicted);
+        for (((quantity, unit, limits, means), least), contradicted) in quantities {
             let means: Vec<Means> = means.into_iter().flatten().collect();
-            let Means { recorded, of_poses } = contradiction(&means, limits, least)?;
-            Some(format!(
-                "agent {id}: the recorded {quantity} is {recorded:.2} {unit} where the recorded poses give \
-                 {of_poses:.2} {unit}: the recorded motion is not used"
-            ))
-        });
-        if let Some(reason) = contradiction {
-            let path = scenario.points_path(agent, 0, None).unwrap_or_default();
-            problems.push(ReadError::malformed(path.parent().unwrap_or(&path), reason));
-            scenario.contradicted.insert(id);
+            if let Some(Means { recorded, of_poses }) = contradiction(&means, limits, least) {
+                let reason = format!(
+                    "agent {id}: the recorded {quantity} is {recorded:.2} {unit} where the recorded poses give \
+                     {of_poses:.2} {unit}: the recorded {quantity} is not used"
+                );
+                problems.push(ReadError::malformed(path.parent().unwrap_or(&path), reason));
+                contradicted.insert(id.clone());
+            }
         }
     }
     problems
@@ -202,14 +202,15 @@ mod tests {
             let message = dataset.problems[0].to_string();
             let expected = format!(
                 "1: agent 1: the recorded speed is {recorded} m/s where the recorded poses give 10.00 m/s: the recorded \
-                 motion is not used"
+                 speed is not used"
             );
             assert!(message.ends_with(&expected), "{message}");
         }
     }
 
-    /// Problems of thirty frames at 10 m/s along x that turn to the right by 30 degrees/s, with this recorded motion.
-    fn problems_of_turn(imu: &str) -> Vec<String> {
+    /// Problems of thirty frames at 10 m/s along x that turn to the right by 30 degrees/s, with this recorded motion; and
+    /// whether speed and yaw rate are used.
+    fn problems_of_turn(imu: &str) -> (Vec<String>, [bool; 2]) {
         let dir = tempfile::tempdir().unwrap();
         for frame in 0..30 {
             let yaw = 3 * frame;
@@ -219,29 +220,36 @@ mod tests {
             let name = format!("1/{frame:06}");
             write_frame(dir.path(), &name, &yaml, &[[1.0, 2.0, 3.0, 0.5]]);
         }
-        let problems = crate::open(dir.path()).unwrap().problems;
-        problems.iter().map(ToString::to_string).collect()
+        let dataset = crate::open(dir.path()).unwrap();
+        let frame = dataset.scenarios[0].load(0, 7, &LoadOptions::default());
+        let frame = frame.unwrap();
+        let is_used = [frame.speed_mps.is_some(), frame.yaw_rate_rad_s.is_some()];
+        let problems = dataset.problems.iter().map(ToString::to_string);
+        (problems.collect(), is_used)
     }
 
     #[test]
     fn yaw_rates_and_signs_of_speeds_that_the_poses_contradict_are_named() {
         let sound = problems_of_turn("speed_mps: 10, yaw_rate_degps: 30");
-        assert_eq!(sound, Vec::<String>::new());
-        for (imu, expected) in [
+        assert_eq!(sound, (Vec::new(), [true; 2]));
+        for (imu, expected, is_used) in [
             (
                 "speed_mps: 10, yaw_rate_degps: -30",
                 "the recorded yaw rate is 30.00 degrees/s where the recorded poses give -30.00 degrees/s",
+                [true, false],
             ),
             (
                 "speed_mps: -10, yaw_rate_degps: 30",
                 "the recorded speed is -10.00 m/s where the recorded poses give 10.00 m/s",
+                [false, true],
             ),
         ] {
-            let problems = problems_of_turn(imu);
+            let (problems, used) = problems_of_turn(imu);
             assert!(
                 problems.len() == 1 && problems[0].contains(expected),
                 "{problems:?}"
             );
+            assert_eq!(used, is_used, "{imu}: the other is used");
         }
     }
 

@@ -47,7 +47,9 @@ impl Unit {
         };
         let since_epoch =
             |unit: &Self| least * unit.seconds() >= EPOCH_S.start && fits(unit, MOST_EPOCH_STEP_S);
-        let of_lidar = |unit: &Self| LIDAR_STEP_S.contains(&(step * unit.seconds()));
+        let of_lidar = |unit: &Self| {
+            step * unit.seconds() >= *LIDAR_STEP_S.start() && fits(unit, *LIDAR_STEP_S.end())
+        };
         (Self::iter().find(since_epoch))
             .or_else(|| Self::iter().find(of_lidar))
             .or_else(|| Self::iter().find(|unit| fits(unit, MOST_STEP_S)))
@@ -72,16 +74,20 @@ impl Unit {
     }
 }
 
-/// The problem that times since a start, nanoseconds, do not follow one another as those of a LiDAR do.
+/// The problem that times since a start, nanoseconds, do not follow one another as those of a LiDAR do, or jump as the
+/// digits of a clock (`101559.9`, `101600.0`) do after every minute.
 pub(super) fn step_problem(path: &Path, nanos: &[u64]) -> Option<ReadError> {
     let times_s: Vec<f64> = nanos.iter().map(|nanos| *nanos as f64 * 1e-9).collect();
     let (first, last) = (times_s.first()?, times_s.last()?);
     let step_s = median_step(&times_s);
-    let is_usual = step_s == 0.0 || LIDAR_STEP_S.contains(&step_s) || *first >= EPOCH_S.start;
-    (!is_usual).then(|| {
+    let mut steps = times_s.array_windows();
+    let is_clock = times_s.iter().all(|time| time % 100.0 < 60.0)
+        && steps.any(|[a, b]| b % 100.0 < a % 100.0 && (40.0..=45.0).contains(&(b - a)));
+    let is_usual = step_s == 0.0 || LIDAR_STEP_S.contains(&step_s);
+    (*first < EPOCH_S.start && (is_clock || !is_usual)).then(|| {
         let reason = format!(
-            "taken as times from {first:.3} s to {last:.3} s with a median step of {step_s:.6} s, expected 0.005 to 5 s: \
-             their unit is doubtful"
+            "taken as times from {first:.3} s to {last:.3} s with a median step of {step_s:.6} s, expected 0.005 to 5 s \
+             and no digits of a date or a clock: their unit is doubtful"
         );
         ReadError::malformed(path, reason)
     })
@@ -154,12 +160,31 @@ mod tests {
     }
 
     #[test]
+    fn digits_of_a_date_or_a_clock_are_no_times() {
+        let found = |times: &[f64]| {
+            let mut problems = Vec::new();
+            let unit = Unit::of_file(Path::new("a"), times, &mut problems);
+            let nanos: Vec<u64> = times.iter().map(|time| unit.nanos(*time)).collect();
+            assert!(nanos.is_sorted_by(|a, b| a < b), "{nanos:?}");
+            problems.len()
+        };
+        // 2023-04-12 10:15:59.5: every time was the largest one.
+        assert_eq!(
+            found(&[20_230_412_101_559_500.0, 20_230_412_101_559_600.0]),
+            1
+        );
+        assert_eq!(found(&[101_559.8, 101_559.9, 101_600.0, 101_600.1]), 1);
+        assert_eq!(found(&[101_559.8, 101_559.9, 101_560.0, 101_560.1]), 0);
+        assert_eq!(found(&[101_599.8, 101_599.9, 101_600.0, 101_600.1]), 0);
+    }
+
+    #[test]
     fn a_step_that_no_lidar_has_is_a_problem() {
         let mut problems = Vec::new();
         let unit = Unit::of_file(Path::new("a"), &[0.0, 0.001, 0.002], &mut problems);
         let shown: Vec<String> = problems.iter().map(ToString::to_string).collect();
-        let expected = "a: taken as times from 0.000 s to 0.002 s with a median step of 0.001000 s, expected 0.005 to 5 s: \
-                        their unit is doubtful";
+        let expected = "a: taken as times from 0.000 s to 0.002 s with a median step of 0.001000 s, expected 0.005 to 5 s \
+                        and no digits of a date or a clock: their unit is doubtful";
         assert_eq!((unit, shown), (Unit::Seconds, vec![expected.to_owned()]));
     }
 }

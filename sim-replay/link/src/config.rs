@@ -47,7 +47,7 @@ pub enum CapacityConfig {
     TokenBucket {
         /// Long-run rate, Mbit/s.
         bandwidth_mbps: f64,
-        /// Bytes that may be sent at once after a pause.
+        /// Bytes that may be sent at once, at the beginning and after a pause.
         #[serde(default)]
         burst_bytes: u64,
     },
@@ -82,13 +82,13 @@ impl CapacityConfig {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct QueueConfig {
-    /// Bytes that may wait, excluding the message that is being sent.
+    /// Bytes that may wait, of urgent messages too, excluding the message that is being sent.
     pub bytes: u64,
     /// Message that is dropped if the queue is full.
     pub drop: QueueDrop,
-    /// True if a newer message of the same stream replaces one that waits.
+    /// True if a newer message of the same stream replaces one that waits, which counts as `link_queue`.
     pub keep_last: bool,
-    /// Messages of at most this many bytes do not wait behind larger ones.
+    /// Messages of at most this many bytes do not wait behind larger ones, which they interrupt. They keep their own order.
     pub urgent_bytes: u64,
 }
 
@@ -125,11 +125,11 @@ pub enum LatencyModel {
     ConstantMs(f64),
     /// Between two bounds, milliseconds.
     UniformMs([f64; 2]),
-    /// Normal, truncated at 0.
+    /// Normal, with 0 in place of negative delays.
     Normal {
-        /// Mean before truncation, milliseconds.
+        /// Mean before that, milliseconds.
         mean_ms: f64,
-        /// Standard deviation, milliseconds.
+        /// Standard deviation before that, milliseconds.
         std_ms: f64,
     },
     /// Lognormal.
@@ -161,7 +161,8 @@ pub enum LossModel {
     None,
     /// Independent losses with one probability.
     Bernoulli(f64),
-    /// A Markov chain of two states (Gilbert 1960, Elliott 1963), one step per message or fragment.
+    /// A Markov chain of two states (Gilbert 1960, Elliott 1963) per sender and receiver, with one step per message or
+    /// fragment of any stream: a burst counts poses too.
     GilbertElliott {
         /// Probability of going from good to bad.
         to_bad: f64,
@@ -174,7 +175,8 @@ pub enum LossModel {
         #[serde(default = "one")]
         loss_bad: f64,
     },
-    /// By the distance between sender and receiver: points of metres and probability, interpolated linearly.
+    /// By the distance between sender and receiver: points of metres and probability, interpolated linearly. Beyond the
+    /// last point, and without a position, that of the last.
     Distance(Vec<[f64; 2]>),
     /// The column of the capacity's trace.
     Trace,
@@ -238,7 +240,7 @@ pub struct LinkConfig {
     pub loss_unit: LossUnit,
     /// Reordering of messages.
     pub reorder: Option<ReorderConfig>,
-    /// Share of the messages that arrive twice.
+    /// Share of the messages that arrive twice. No copy is used.
     pub duplicate: f64,
     /// Times without any transmission.
     pub outages: Vec<Outage>,

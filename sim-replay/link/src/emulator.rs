@@ -187,8 +187,9 @@ impl LinkEmulator {
     fn settle(&mut self, left: Departure) {
         match left {
             // Queues drop on a submission only, which is now.
-            Departure::Dropped(packet, reason) => {
-                self.schedule(self.now_nanos, packet, Delivery::Dropped(reason))
+            Departure::Dropped(packet) => {
+                let dropped = Delivery::Dropped(DropReason::LinkQueue);
+                self.schedule(self.now_nanos, packet, dropped);
             }
             Departure::Sent(packet, sent_nanos) => self.propagate(packet, sent_nanos),
         }

@@ -6,6 +6,11 @@ use support::nanos;
 use support::random::SplitMix64;
 
 impl LatencyModel {
+    /// True if it contains the transmission at a rate, beside that of the capacity.
+    pub fn has_rate(&self) -> bool {
+        matches!(self, Self::BySize { .. })
+    }
+
     /// Delay of one message, nanoseconds; `step` is that of the trace at which its last bit was sent.
     pub(super) fn draw(self, random: &mut SplitMix64, step: Option<&Step>, bytes: u64) -> u64 {
         // Negative draws of the normal distribution become 0 in the conversion.

@@ -146,6 +146,7 @@ mod tests {
             (100.0, 0.25),
             (150.0, 0.5),
             (900.0, 0.5),
+            (f64::INFINITY, 0.5),
         ] {
             let found = losses(&law, LossUnit::Message, 10, distance_m);
             assert!(

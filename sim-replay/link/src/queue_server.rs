@@ -2,8 +2,6 @@
 
 use std::collections::VecDeque;
 
-use protocol::DropReason;
-
 use super::capacity::{ServiceCurve, work};
 use super::config::{QueueConfig, QueueDrop};
 use super::packet::Packet;
@@ -11,12 +9,12 @@ use super::packet::Packet;
 /// A queue and its sender.
 #[derive(Debug, Clone, Default)]
 pub(super) struct QueueServer {
-    /// All work up to here is used: the next packet ends later.
+    /// All work up to here is used: the next packet ends later. Work counts from a full burst at the beginning.
     used: u128,
-    /// The same for urgent messages among themselves.
-    urgent_used: u128,
     sending: Option<Sending>,
-    urgent: VecDeque<Sending>,
+    /// A larger packet, which is sent on when no urgent one waits any more.
+    interrupted: Option<Sending>,
+    /// In order of submission. Urgent ones are sent first, each of both kinds in this order.
     waiting: VecDeque<Packet>,
     waiting_bytes: u64,
 }
@@ -25,7 +23,7 @@ pub(super) struct QueueServer {
 struct Sending {
     packet: Packet,
     start_nanos: u64,
-    /// Its last bit is sent when this much work could have been done.
+    /// Its last bit is sent when this much work could have been done, the burst included.
     end: u128,
 }
 
@@ -35,7 +33,7 @@ pub(super) enum Departure {
     /// The packet, and the times at which its first and its last bit were sent, nanoseconds.
     Sent(Packet, [u64; 2]),
     /// The packet was dropped when another was submitted, or on its own submission.
-    Dropped(Packet, DropReason),
+    Dropped(Packet),
 }
 
 /// Parameters of a queue.
@@ -46,6 +44,12 @@ pub(super) struct Rules {
     pub(super) queue: QueueConfig,
 }
 
+impl Rules {
+    fn is_urgent(&self, packet: &Packet) -> bool {
+        packet.bytes <= self.queue.urgent_bytes
+    }
+}
+
 impl QueueServer {
     /// Submits a packet now. The queue has been advanced to now.
     pub(super) fn submit(&mut self, packet: Packet, rules: &Rules, left: &mut Vec<Departure>) {
@@ -54,18 +58,24 @@ impl QueueServer {
             left.push(Departure::Sent(packet, [nanos; 2]));
             return;
         }
+        let done = rules.capacity.done_by(nanos);
         // Before the limits of the queue: an idle sender takes a packet of any size.
         if self.sending.is_none() {
-            self.send(packet, nanos, rules);
-            return;
-        }
-        if packet.bytes <= rules.queue.urgent_bytes {
-            self.cut_in(packet, rules);
+            // Capacity unused before now is lost, except for the burst.
+            self.send(packet, nanos, self.used.max(done));
             return;
         }
         // Before the queue is measured: the bytes of the replaced message make room for the new one.
         if rules.queue.keep_last {
             self.supersede(&packet, left);
+        }
+        let is_larger = |sending: &mut Sending| !rules.is_urgent(&sending.packet);
+        if rules.is_urgent(&packet)
+            && let Some(larger) = self.sending.take_if(is_larger)
+        {
+            self.interrupted = Some(larger);
+            self.send(packet, nanos, done + work(rules.burst_bytes));
+            return;
         }
         // A packet larger than the whole queue empties it and is dropped itself below.
         while rules.queue.drop == QueueDrop::Head && self.is_full_for(&packet, rules) {
@@ -73,10 +83,10 @@ impl QueueServer {
                 break;
             };
             self.waiting_bytes -= oldest.bytes;
-            left.push(Departure::Dropped(oldest, DropReason::LinkQueue));
+            left.push(Departure::Dropped(oldest));
         }
         if self.is_full_for(&packet, rules) {
-            left.push(Departure::Dropped(packet, DropReason::LinkQueue));
+            left.push(Departure::Dropped(packet));
             return;
         }
         self.waiting_bytes += packet.bytes;
@@ -89,69 +99,48 @@ impl QueueServer {
 
     /// Advances to `nanos`; the packets sent by then are added to `left`, in that order.
     pub(super) fn advance(&mut self, nanos: u64, rules: &Rules, left: &mut Vec<Departure>) {
-        while let Some((end_nanos, is_urgent)) = self.next(rules)
+        while let Some(end_nanos) = self.next_nanos(rules)
             && end_nanos <= nanos
+            && let Some(sent) = self.sending.take()
         {
-            let sent = match is_urgent {
-                true => self.urgent.pop_front(),
-                false => self.sending.take(),
-            };
-            let Some(sent) = sent else { return };
+            self.used = sent.end;
             let sent_nanos = [sent.start_nanos, end_nanos];
             left.push(Departure::Sent(sent.packet, sent_nanos));
-            // Urgent packets share the rate with the one being sent and do not free the sender.
-            if !is_urgent && let Some(next) = self.waiting.pop_front() {
-                self.waiting_bytes -= next.bytes;
-                self.send(next, end_nanos, rules);
-            }
+            self.send_next(end_nanos, rules);
         }
     }
 
     /// Time at which the next last bit is sent.
     pub(super) fn next_nanos(&self, rules: &Rules) -> Option<u64> {
-        self.next(rules).map(|(nanos, _)| nanos)
+        let sending = self.sending.as_ref()?;
+        let from_rate = sending.end.saturating_sub(work(rules.burst_bytes));
+        // With a burst the work may have been available before the packet was submitted.
+        Some(rules.capacity.time_of(from_rate)?.max(sending.start_nanos))
     }
 
-    /// The same, with true for an urgent packet.
-    fn next(&self, rules: &Rules) -> Option<(u64, bool)> {
-        let urgent = self.urgent.front().map(|sending| (sending, true));
-        let usual = self.sending.as_ref().map(|sending| (sending, false));
-        let ends = urgent.into_iter().chain(usual);
-        let ends = ends.filter_map(|(sending, is_urgent)| {
-            // With a burst the work may have been available before the packet was submitted.
-            let end_nanos = rules.capacity.time_of(sending.end)?;
-            Some((end_nanos.max(sending.start_nanos), is_urgent))
-        });
-        // Of two at the same time the first, which is the urgent one.
-        ends.min_by_key(|(nanos, _)| *nanos)
+    /// The oldest urgent packet, else the interrupted one, else the oldest.
+    fn send_next(&mut self, nanos: u64, rules: &Rules) {
+        let mut waiting = self.waiting.iter();
+        let urgent = waiting.position(|packet| rules.is_urgent(packet));
+        if urgent.is_none() && self.interrupted.is_some() {
+            self.sending = self.interrupted.take();
+        } else if let Some(next) = self.waiting.remove(urgent.unwrap_or(0)) {
+            self.waiting_bytes -= next.bytes;
+            self.send(next, nanos, self.used);
+        }
     }
 
-    fn send(&mut self, packet: Packet, nanos: u64, rules: &Rules) {
-        // Capacity unused before now is lost, except for the burst.
-        let done = rules.capacity.done_by(nanos);
-        let idle = done.saturating_sub(work(rules.burst_bytes));
-        self.used = self.used.max(idle) + work(packet.bytes);
+    /// Begins to send a packet behind the work `before`.
+    fn send(&mut self, packet: Packet, start_nanos: u64, before: u128) {
+        let added = work(packet.bytes);
+        // The capacity that an urgent packet takes is missing to the interrupted one: no rate is created.
+        if let Some(interrupted) = &mut self.interrupted {
+            interrupted.end += added;
+        }
         self.sending = Some(Sending {
             packet,
-            start_nanos: nanos,
-            end: self.used,
-        });
-    }
-
-    /// Inserts an urgent packet: the end of the packet being sent is delayed by its duration.
-    fn cut_in(&mut self, packet: Packet, rules: &Rules) {
-        let nanos = packet.submitted_nanos;
-        let added = work(packet.bytes);
-        self.urgent_used = self.urgent_used.max(rules.capacity.done_by(nanos)) + added;
-        // The capacity that the urgent packet takes is missing to all others: no rate is created.
-        self.used += added;
-        if let Some(sending) = &mut self.sending {
-            sending.end += added;
-        }
-        self.urgent.push_back(Sending {
-            packet,
-            start_nanos: nanos,
-            end: self.urgent_used,
+            start_nanos,
+            end: before + added,
         });
     }
 
@@ -163,7 +152,7 @@ impl QueueServer {
                 return;
             };
             self.waiting_bytes -= older.bytes;
-            left.push(Departure::Dropped(older, DropReason::Superseded));
+            left.push(Departure::Dropped(older));
         }
     }
 }

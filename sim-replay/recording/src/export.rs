@@ -64,21 +64,22 @@ pub fn export_ros2(
         zstd_level,
         contents: Contents::Ros2,
     };
-    let mut writer = RecordingWriter::create(to, options)?;
     let vehicles = wanted.iter().filter_map(|entry| match &entry.key.topic {
         Topic::Stream { cav, .. } => Some(cav.clone()),
         _ => None,
     });
     let vehicles: BTreeSet<CavId> = vehicles.collect();
-    // The mounts come before the first sweep, whose frame refers to them.
-    if let Some((first, _)) = timed.first().filter(|_| !vehicles.is_empty()) {
-        writer.write_static_transforms(*first, &vehicles, mount)?;
-    }
-    for (nanos, entry) in timed {
-        writer.write(&entry.key, nanos, &recording.read(entry)?)?;
-    }
-    writer.finish()?;
-    let messages = writer.whole_messages();
+    let messages = RecordingWriter::whole(to, options, |writer| {
+        // The mounts come before the first sweep, whose frame refers to them.
+        if let Some((first, _)) = timed.first().filter(|_| !vehicles.is_empty()) {
+            writer.write_static_transforms(*first, &vehicles, mount)?;
+        }
+        for (nanos, entry) in timed {
+            writer.write(&entry.key, nanos, &recording.read(entry)?)?;
+        }
+        writer.finish()?;
+        Ok(writer.whole_messages())
+    })?;
     Ok(ExportReport {
         messages,
         left_out: (recording.entries().len() as u64).saturating_sub(messages),

@@ -38,7 +38,7 @@ impl Recording {
             return Err(RecordingError::foreign(path, String::new()));
         }
         let (mut has_any, mut has_own) = (false, false);
-        let mut entries = Vec::new();
+        let (mut entries, mut no_key) = (Vec::new(), None);
         let file = McapFile::open(path, &mut |message, place| {
             has_any = true;
             if message.channel.message_encoding != OWN_ENCODING {
@@ -47,8 +47,9 @@ impl Recording {
             has_own = true;
             // A payload that was no valid message when it was recorded is skipped.
             let header = wire::decode_header([message.data.as_ref()]).ok();
-            let entry = message.channel.topic.parse().ok().zip(header);
-            let entry = entry.map(|(key, header)| Entry {
+            let key = message.channel.topic.parse::<Key>();
+            let key = key.inspect_err(|error| no_key = Some(error.clone()));
+            let entry = key.ok().zip(header).map(|(key, header)| Entry {
                 key,
                 header,
                 arrived_nanos: message.log_time,
@@ -69,6 +70,10 @@ impl Recording {
                     RecordingError::not_ours(path, reason)
                 }
             });
+        }
+        if let (true, Some(error)) = (entries.is_empty(), no_key) {
+            let reason = format_args!("none of its messages can be read: {error}");
+            return Err(RecordingError::not_ours(path, reason));
         }
         Ok(Self { file, entries })
     }

@@ -22,23 +22,24 @@ pub struct RecoverReport {
 /// [`crate::RecordingError`] if `from` holds no message of this program, or `to` exists already or cannot be written.
 pub fn recover(from: &Path, to: &Path, options: RecordingOptions) -> Result<RecoverReport> {
     let recording = Recording::open(from)?;
-    let mut writer = RecordingWriter::create(to, options)?;
-    let mut messages = 0;
-    for held in recording.file.all() {
-        for message in held?.iter() {
-            let encoding = message.channel.message_encoding.as_str();
-            // The channels for ROS 2 are derived from these.
-            if matches!(encoding, OWN_ENCODING | "json")
-                && let Ok(key) = message.channel.topic.parse()
-            {
-                messages += 1;
-                writer.write(&key, message.log_time, &message.data)?;
+    RecordingWriter::whole(to, options, |writer| {
+        let mut messages = 0;
+        for held in recording.file.all() {
+            for message in held?.iter() {
+                let encoding = message.channel.message_encoding.as_str();
+                // The channels for ROS 2 are derived from these.
+                if matches!(encoding, OWN_ENCODING | "json")
+                    && let Ok(key) = message.channel.topic.parse()
+                {
+                    messages += 1;
+                    writer.write(&key, message.log_time, &message.data)?;
+                }
             }
         }
-    }
-    writer.finish()?;
-    Ok(RecoverReport {
-        messages,
-        damage: recording.damage().to_vec(),
+        writer.finish()?;
+        Ok(RecoverReport {
+            messages,
+            damage: recording.damage().to_vec(),
+        })
     })
 }

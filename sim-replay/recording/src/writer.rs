@@ -1,7 +1,8 @@
 //! Writer of recordings: messages in, whole chunks out.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::fs::File;
+use std::fs::{self, File};
+use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
 use mcap::records::MessageHeader;
@@ -9,6 +10,7 @@ use mcap::write::NoSeek;
 use mcap::{Compression, McapError, McapResult, WriteOptions};
 use protocol::{CavId, Header, Key, Limits, RunId, Topic, wire};
 use ros2::{Distribution, Mount, RosMessage, RosTopic, Translator};
+use support::atomic_file;
 
 use super::sink::{Store, WholeChunks};
 use super::{OWN_ENCODING, RecordingError};
@@ -76,6 +78,28 @@ impl RecordingWriter<File> {
     pub fn create(path: &Path, options: RecordingOptions) -> Result<Self> {
         let file = File::create_new(path).map_err(RecordingError::io(path))?;
         Self::over(file, path, options)
+    }
+
+    /// A new file that `write` writes and finishes, and that has its name only then.
+    ///
+    /// # Errors
+    /// [`RecordingError::Io`] if the file exists already; those of `write`. No part of the file is left then.
+    pub(super) fn whole<T>(
+        path: &Path,
+        options: RecordingOptions,
+        write: impl FnOnce(&mut Self) -> Result<T>,
+    ) -> Result<T> {
+        if path.exists() {
+            return Err(RecordingError::io(path)(ErrorKind::AlreadyExists.into()));
+        }
+        let part = path.with_extension("mcap.unfinished");
+        let file = File::create(&part).map_err(RecordingError::io(&part));
+        let named = file.and_then(|file| {
+            let written = write(&mut Self::over(file, &part, options)?)?;
+            let named = fs::rename(&part, path).and_then(|()| atomic_file::sync_name(path));
+            named.map_err(RecordingError::io(path)).map(|()| written)
+        });
+        named.inspect_err(|_| drop(fs::remove_file(&part)))
     }
 }
 

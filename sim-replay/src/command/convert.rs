@@ -7,8 +7,7 @@ use simulator::generate::{Converted, SceneLayout, SynthError, convert};
 use support::output;
 use terminal::progress;
 
-use super::refuse;
-use support::cli::Outcome;
+use support::cli::{BadInput, Outcome};
 
 /// Problems that are printed; all are counted, and included in the JSON summary.
 const SHOWN_PROBLEMS: usize = 10;
@@ -39,21 +38,15 @@ pub(crate) struct Args {
 /// Converts and prints a summary to standard output.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     let open = OpenOptions::with_intensity_scale(args.intensity.scale);
-    let input = match dataset::open_with(&args.from, &open) {
-        Ok(input) => input,
-        Err(error) => return refuse(&error),
-    };
+    let input = dataset::open_with(&args.from, &open).map_err(BadInput::of)?;
     if overlap(&args.from, &args.out) {
-        return refuse(&format_args!(
+        return Ok(Outcome::bad_input(&format_args!(
             "{}: the input is in this folder; choose another folder for --out",
             args.out.display()
-        ));
+        )));
     }
     let bar = progress::bar(0, "frames");
-    let advance = |done: usize, total: usize| {
-        bar.set_length(total as u64);
-        bar.set_position(done as u64);
-    };
+    let advance = progress::shown_on(&bar);
     let result = convert(&input, &args.out, args.layout, args.force, &advance);
     bar.finish_and_clear();
     match result {
@@ -62,7 +55,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
             Ok(Outcome::of(!converted.left_out.is_nothing()))
         }
         Err(error @ SynthError::Write(_)) => Err(error.into()),
-        Err(error) => refuse(&error),
+        Err(error) => Ok(Outcome::bad_input(&error)),
     }
 }
 

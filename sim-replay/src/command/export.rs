@@ -6,7 +6,7 @@ use super::print_json;
 use bus::log_to_stderr;
 use recording::{ExportTimes, export_ros2};
 use ros2::Mount;
-use support::cli::Outcome;
+use support::cli::{BadInput, Outcome};
 use support::output;
 
 /// Write a recording as a bag of ROS 2: clouds, poses, odometry, detections, tracks, transforms and diagnoses, without the
@@ -43,10 +43,8 @@ pub(crate) struct Args {
 pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     log_to_stderr();
     let (times, mount) = (args.times, args.lidar_mount.unwrap_or_default());
-    let report = match export_ros2(&args.from, &args.to, times, &mount, args.zstd_level) {
-        Ok(report) => report,
-        Err(error) => return Ok(Outcome::bad_input(&error)),
-    };
+    let report = export_ros2(&args.from, &args.to, times, &mount, args.zstd_level);
+    let report = report.map_err(BadInput::of)?;
     if args.json {
         print_json(&report)?;
     } else {

@@ -10,8 +10,7 @@ use sim_replay::inspect::{inspect, inspect_map};
 use support::output;
 use terminal::progress;
 
-use super::refuse;
-use support::cli::Outcome;
+use support::cli::{BadInput, Outcome};
 
 /// Report the contents of a dataset (agents, frames, points, rates, boxes, merged ground truth) and its faults.
 #[derive(Debug, clap::Args)]
@@ -44,18 +43,14 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
                 "{map}: a map has no intensities and no protocol: leave such options out"
             )));
         }
-        return match inspect_map(&args.dir) {
-            Ok(report) => print(&report, args.json).map(|()| Outcome::Done),
-            Err(error) => refuse(&error),
-        };
+        let report = inspect_map(&args.dir).map_err(BadInput::of)?;
+        return print(&report, args.json).map(|()| Outcome::Done);
     }
     // The bar hides itself if stderr is no terminal.
     let bar = progress::bar(0, "frames");
     let options = OpenOptions::with_intensity_scale(args.intensity_scale);
-    let report = inspect(&args.dir, &options, &args.protocol, &|done, total| {
-        bar.set_length(total as u64);
-        bar.set_position(done as u64);
-    });
+    let on_frame = progress::shown_on(&bar);
+    let report = inspect(&args.dir, &options, &args.protocol, &on_frame);
     bar.finish_and_clear();
     print(&report, args.json)?;
     Ok(match report.problems.is_empty() {

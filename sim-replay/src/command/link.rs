@@ -8,7 +8,7 @@ use sim_replay::config::LinkProcessConfig;
 use sim_replay::link_node::{self, LinkReport, NodeOptions};
 use support::output;
 
-use super::{ProcessArgs, join, leave, print_json};
+use super::{ProcessArgs, join, print_json};
 use support::cli::{BadInput, Outcome};
 
 /// Forward the agents' messages to an ego as a wireless link would: delayed, queued or lost.
@@ -85,7 +85,7 @@ fn forward(args: ForwardArgs) -> anyhow::Result<Outcome> {
     };
     let report = link_node::run(&bus, emulator, &options, &stop)?;
     print(&report, args.json)?;
-    leave(bus);
+    bus.leave_at_end();
     Ok(Outcome::of(!report.is_complete()))
 }
 

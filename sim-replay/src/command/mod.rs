@@ -9,14 +9,11 @@ pub(crate) mod recover;
 pub(crate) mod stream;
 pub(crate) mod synth;
 
-use std::fmt::Display;
-
 use anyhow::Context;
 use bus::shutdown::Stop;
-use bus::{Bus, BusConfig, Configured, ProcessConfig, STOP_LIMIT};
+use bus::{Bus, BusConfig, Configured, ProcessConfig};
 use protocol::{CavId, Role, RunId};
 use serde::Serialize;
-use support::cli::Outcome;
 use support::output;
 
 // Without a doc comment, which clap would show as the description of the sub-command.
@@ -34,22 +31,9 @@ fn print_json(report: &impl Serialize) -> anyhow::Result<()> {
     Ok(output::line(serde_json::to_string(report)?)?)
 }
 
-/// Says what is wrong with the input, unless only errors are wanted.
-fn refuse(error: &dyn Display) -> anyhow::Result<Outcome> {
-    output::note(format_args!("error: {error}"));
-    Ok(Outcome::BadInput)
-}
-
 /// Joins a run under a name; signals request its stop.
 fn join(bus: &BusConfig, run: &RunId, role: Role, name: &CavId) -> anyhow::Result<(Stop, Bus)> {
     let stop = bus.stop().context("installing signal handlers")?;
     let bus = bus.join(&stop, run, role, name)?;
     Ok((stop, bus))
-}
-
-/// Leaves the bus; a process ends even if the router does not answer.
-fn leave(bus: Bus) {
-    if let Err(overdue) = bus.leave(STOP_LIMIT) {
-        tracing::warn!("{overdue}");
-    }
 }

@@ -6,7 +6,7 @@ use sim_replay::config::RecorderConfig;
 use sim_replay::recorder::{self, RecordReport, RecorderError};
 use support::output;
 
-use super::{ProcessArgs, join, leave, print_json};
+use super::{ProcessArgs, join, print_json};
 use support::cli::Outcome;
 
 /// Records and prints a summary to standard output.
@@ -27,7 +27,7 @@ pub(crate) fn run(args: ProcessArgs<RecorderConfig>) -> anyhow::Result<Outcome> 
         Err(error) => return Err(error.into()),
     };
     print(&report, args.json)?;
-    leave(bus);
+    bus.leave_at_end();
     Ok(Outcome::of(!report.is_complete()))
 }
 

@@ -7,8 +7,8 @@ use recording::recover;
 use sim_replay::config::RecordingConfig;
 use support::output;
 
-use super::{print_json, refuse};
-use support::cli::Outcome;
+use super::print_json;
+use support::cli::{BadInput, Outcome};
 
 /// Copy the readable part of a truncated (power, disk, kill) or damaged recording into a new, indexed file.
 ///
@@ -35,10 +35,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
         plain: args.plain,
         ..RecordingConfig::default()
     };
-    let report = match recover(&args.from, &args.out, config.options()) {
-        Ok(report) => report,
-        Err(error) => return refuse(&error),
-    };
+    let report = recover(&args.from, &args.out, config.options()).map_err(BadInput::of)?;
     if args.json {
         print_json(&report)?;
     } else {

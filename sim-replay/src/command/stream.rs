@@ -10,7 +10,7 @@ use sim_replay::config::{ReplayConfig, SceneConfig};
 use sim_replay::stream::{Place, Replay, StreamError, StreamReport};
 use support::output;
 
-use super::{ProcessArgs, join, leave, print_json};
+use super::{ProcessArgs, join, print_json};
 use support::cli::Outcome;
 
 /// Plays the scene and prints a summary to standard output.
@@ -42,7 +42,7 @@ pub(crate) fn run(args: ProcessArgs<ReplayConfig>) -> anyhow::Result<Outcome> {
     );
     let report = replay.play();
     print(&report, args.json)?;
-    leave(bus);
+    bus.leave_at_end();
     // Not before: a replay that crashes while it leaves is restarted, and announces its end.
     let checkpoint = config.checkpoint.filter(|_| !stop.requested());
     if let Some(Err(error)) = checkpoint.map(|path| Place::end(&path)) {

@@ -13,7 +13,6 @@ use simulator::map::RoadMapSource;
 use support::output;
 use terminal::progress;
 
-use super::refuse;
 use support::cli::{BadInput, Outcome};
 
 /// Findings of a map that are printed one by one.
@@ -104,7 +103,7 @@ pub(crate) fn run(args: Args) -> anyhow::Result<Outcome> {
         Err(error @ (SynthError::Write(_) | SynthError::TooFewCompanions { .. })) => {
             Err(error.into())
         }
-        Err(error) => refuse(&error),
+        Err(error) => Ok(Outcome::bad_input(&error)),
     }
 }
 

@@ -8,7 +8,6 @@ use protocol::CavId;
 use rayon::prelude::*;
 
 use super::{AgentReport, CountSummary, Problem, Report, ScenarioReport, TickReport};
-use crate::stream::median_step_nanos;
 use dataset::evaluation_protocol::ProtocolConfig;
 use dataset::findings::{self, FrameFindings, SweepReport};
 use dataset::frame::Frame;
@@ -231,10 +230,10 @@ fn merged_counts(
 }
 
 fn summarize(scenario: &Scenario, findings: &[TickFindings]) -> ScenarioReport {
-    let times = scenario.ticks.iter().map(|tick| tick.capture_nanos);
-    let times: Vec<u64> = times.collect();
-    let ends = times.first().zip(times.last());
-    let span = ends.map_or(0, |(first, last)| last.saturating_sub(*first));
+    let ends = scenario.ticks.first().zip(scenario.ticks.last());
+    let span = ends.map_or(0, |(first, last)| {
+        last.capture_nanos.saturating_sub(first.capture_nanos)
+    });
     let agents = scenario.agents.iter().enumerate().map(|(agent, id)| {
         let frames = findings.iter().map(|tick| &tick.agents[agent]);
         summarize_agent(id, &frames.collect::<Vec<_>>())
@@ -245,7 +244,7 @@ fn summarize(scenario: &Scenario, findings: &[TickFindings]) -> ScenarioReport {
         handedness: scenario.source_handedness,
         frames: scenario.ticks.len(),
         seconds: span as f64 / 1e9,
-        rate_hz: median_step_nanos(&times).map(|step| 1e9 / step as f64),
+        rate_hz: dataset::period_nanos(&scenario.ticks).map(|period| 1e9 / period as f64),
         agents: agents.collect(),
         lidar_variants: scenario.lidar_variants.clone(),
         has_radar: scenario.has_radar,

@@ -20,6 +20,5 @@ pub use checkpoint::Place;
 pub(crate) use clock::ReplayClock;
 pub use replay::{Replay, StreamError, StreamOptions};
 pub use report::{Lateness, StreamReport, Unreadable};
-pub(crate) use schedule::median_step_nanos;
 pub use schedule::{Planned, Position, Schedule};
 pub use sensor_link::SensorLinkReport;

@@ -4,9 +4,9 @@ use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 
-use dataset::Tick;
+use dataset::{Tick, period_nanos};
 
-/// Period of a scene with only one tick, nanoseconds.
+/// Period of a scene without one, as of a single tick, nanoseconds.
 const SINGLE_TICK_PERIOD: u64 = 100_000_000;
 /// Gap of capture time at a jump back, nanoseconds, by which vehicles see it: more than the 60 s over which a tracked pose
 /// may be predicted. Object tracks and feature memories last for less.
@@ -47,6 +47,7 @@ pub struct Position {
 #[derive(Debug, Clone)]
 pub struct Schedule {
     captures: Arc<[u64]>,
+    period_nanos: u64,
     repeats: bool,
     /// Its state.
     pub(super) position: Position,
@@ -57,6 +58,7 @@ impl Schedule {
     pub fn new(ticks: &[Tick], first: usize, frames: Option<usize>, repeats: bool) -> Self {
         Self {
             captures: ticks.iter().map(|tick| tick.capture_nanos).collect(),
+            period_nanos: period_nanos(ticks).unwrap_or(SINGLE_TICK_PERIOD),
             repeats,
             position: Position {
                 next_tick: first,
@@ -79,16 +81,6 @@ impl Schedule {
     }
 }
 
-/// The median step between capture times, nanoseconds, if it is above 0: a gap in the recording does not change it, as it
-/// would a mean. A step back, in a faulty data set, counts as 0.
-pub(crate) fn median_step_nanos(captures: &[u64]) -> Option<u64> {
-    let steps = captures.windows(2);
-    let steps = steps.map(|pair| pair[1].saturating_sub(pair[0]));
-    let mut steps: Vec<u64> = steps.collect();
-    steps.sort_unstable();
-    steps.get(steps.len() / 2).copied().filter(|&step| step > 0)
-}
-
 impl Iterator for Schedule {
     type Item = Planned;
 
@@ -106,9 +98,8 @@ impl Iterator for Schedule {
         if let Some(last) = self.position.last_nanos
             && let Some(back_nanos) = last.checked_sub(back_to)
         {
-            let period_nanos = median_step_nanos(&self.captures).unwrap_or(SINGLE_TICK_PERIOD);
             gap_nanos = JUMP_NANOS * u64::from(back_nanos > SHORT_JUMP_NANOS);
-            let step_nanos = period_nanos.saturating_add(gap_nanos);
+            let step_nanos = self.period_nanos.saturating_add(gap_nanos);
             self.position.shift_nanos = last.saturating_add(step_nanos).saturating_sub(recorded);
         }
         let capture_nanos = recorded.saturating_add(self.position.shift_nanos);
@@ -164,7 +155,7 @@ mod tests {
         let schedule = Schedule::new(&ticks(&[100, 200, 350]), 1, Some(6), true);
         assert_eq!(
             plan(schedule, 9),
-            [(1, 200), (2, 350), (0, 500), (1, 600), (2, 750), (0, 900)]
+            [(1, 200), (2, 350), (0, 475), (1, 575), (2, 725), (0, 850)]
         );
         assert_eq!(
             plan(Schedule::new(&ticks(&[7]), 0, None, true), 2),

@@ -42,7 +42,19 @@ impl Row {
             .arrivals
             .iter()
             .map(|arrival| millis(arrival.capture_nanos, arrival.nanos));
-        let dropped = seen.ledger.total().dropped;
+        let mut dropped = seen.ledger.total().dropped;
+        // The queue of the link has room for all: it drops only what a newer message replaces.
+        if let Some(replaced) = dropped.remove(&DropReason::LinkQueue) {
+            *dropped.entry(DropReason::Superseded).or_default() += replaced;
+        }
+        let receivers = seen
+            .ledger
+            .iter()
+            .filter(|(account, _)| account.to.is_some());
+        let held: u64 = receivers.map(|(_, counts)| counts.in_flight).sum();
+        if held > 0 {
+            *dropped.entry(DropReason::Stale).or_default() += held;
+        }
         let on_the_way: u64 = seen
             .ledger
             .iter()

@@ -281,6 +281,41 @@ fn a_link_that_carries_nothing_reports_it() {
 }
 
 #[test]
+fn messages_in_flight_at_the_end_are_not_lost() {
+    let router = TestRouter::open();
+    let [agent, link] = [("agent-7", "7"), ("link-9", "9")].map(|(name, id)| router.join(name, id));
+    let config = LinkConfig {
+        latency: LatencyModel::ConstantMs(60_000.0),
+        ..LinkConfig::default()
+    };
+    let emulator = LinkEmulator::new(config, Path::new("."), 1).unwrap();
+    let (sent, stop, options) = (
+        Topic::Stream {
+            cav: cav("7"),
+            stream: Stream::Points,
+        },
+        Stop::new(),
+        options(),
+    );
+    std::thread::scope(|scope| {
+        let carrying = scope.spawn(|| link_node::run(&link, emulator, &options, &stop).unwrap());
+        let _presence = agent.announce(Role::Agent).unwrap();
+        let publisher = agent
+            .publisher(sent.clone(), PublisherOptions::FEATURES.lossless(16))
+            .unwrap();
+        wait_for_route(&agent, &sent, "link-9");
+        (0..COUNT).for_each(|tick| publisher.submit(tick, points(tick)));
+        publisher.finish();
+        let is_held = || link.stats().ledger().total().in_flight >= COUNT;
+        wait_for("all messages at the link", is_held);
+        stop.request();
+        carrying.join().unwrap()
+    });
+    let total = link.stats().ledger().total();
+    assert!(!total.dropped.contains_key(&DropReason::Stale), "{total:?}");
+}
+
+#[test]
 fn a_flood_is_limited_before_the_link() {
     let router = TestRouter::open();
     let [agent, link] = [("agent-7", "7"), ("link-9", "9")].map(|(name, id)| router.join(name, id));

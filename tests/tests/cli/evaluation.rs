@@ -178,7 +178,7 @@ fn a_tick_without_the_true_pose_of_the_ego_is_left_out_as_if_it_were_not_there()
         (&unposed["frames"], &unposed["left_out"]["ticks"]),
         (&(FRAMES - 1).into(), &1.into())
     );
-    check_other_commands(folder.path(), &finding);
+    check_other_commands(folder.path(), &finding, &unposed["left_out"]["findings"]);
     fs::remove_file(sweep).unwrap();
     fs::remove_file(yaml).unwrap();
     let (_, without, _) = evaluated(&scene);
@@ -186,7 +186,7 @@ fn a_tick_without_the_true_pose_of_the_ego_is_left_out_as_if_it_were_not_there()
 }
 
 /// `ego-fuser eval` and `v2vloc up` in simulation time leave the same tick out, with the same words.
-fn check_other_commands(folder: &Path, finding: &str) {
+fn check_other_commands(folder: &Path, finding: &str, findings: &Value) {
     let weights = deploy_file("weights/lean-max.safetensors");
     let mut eval = Command::new(programs().join("ego-fuser"));
     eval.args(["eval", "--method", "late", "--json", "--weights", &weights]);
@@ -215,6 +215,12 @@ fn check_other_commands(folder: &Path, finding: &str) {
         (&metrics["ticks"], &metrics["answered"]),
         (&(FRAMES - 1).into(), &(FRAMES - 1).into())
     );
+    assert_eq!(&metrics["left_out"]["findings"], findings);
+    let lines = ["detections.jsonl", "truth.jsonl", "frames.csv"].map(|name| {
+        let text = fs::read_to_string(runs.join("test").join(name)).unwrap();
+        text.lines().count()
+    });
+    assert_eq!(lines, [FRAMES, FRAMES - 1, 1 + FRAMES]);
 }
 
 #[test]

@@ -15,7 +15,7 @@ type Row = (&'static str, i32, &'static str);
 const EVAL: &str = "v2vloc eval --dataset {s} --weights {w} --method max";
 
 /// Mistakes in options of an evaluation: what follows [`EVAL`].
-const OF_AN_EVALUATION: [Row; 32] = [
+const OF_AN_EVALUATION: [Row; 35] = [
     (
         "--noise-position-std-m 2",
         2,
@@ -60,6 +60,21 @@ const OF_AN_EVALUATION: [Row; 32] = [
         "--delay-ms 20000",
         2,
         "delay_ms is 20000, must be 0 to 10000",
+    ),
+    (
+        "--boxes only --dtype i8",
+        2,
+        "with boxes only max sends none",
+    ),
+    (
+        "--link ideal --watch-queue",
+        2,
+        "--watch-queue: no map waits",
+    ),
+    (
+        "--link opencood-real --bandwidth-mbps 6",
+        2,
+        "the latency of link opencood-real has a rate",
     ),
     (
         "--method late --boxes only",

@@ -149,10 +149,11 @@ fn a_port_in_use_is_named() {
 
 #[test]
 fn a_missing_program_is_named() {
-    let folder = tempfile::tempdir().unwrap();
+    // Links: a copy cannot be started while a process that another test begins has it open.
+    let folder = tempfile::tempdir_in(programs()).unwrap();
     let scenario = write_scenario(folder.path(), 1, "", "");
     for name in ["v2vloc", "v2vloc-runner"] {
-        fs::copy(programs().join(name), folder.path().join(name)).unwrap();
+        fs::hard_link(programs().join(name), folder.path().join(name)).unwrap();
     }
     let (code, stderr) = up(&folder.path().join("v2vloc"), folder.path(), &scenario);
     assert_eq!(code, Some(1), "{stderr}");

@@ -120,7 +120,7 @@ fn outcomes(folder: &std::path::Path, methods: &[AlignmentSpec]) -> Vec<PairOutc
         alignment::run(
             methods,
             &mut BoxSource::Annotated,
-            &scenario,
+            (&scenario, 70.0),
             ticks,
             &mut |outcome| found.push(outcome),
         )
@@ -191,9 +191,9 @@ fn approaches_meet_on_generated_scenes() {
     );
     // Poses have some dozen bytes, boxes some hundred, sweeps some ten thousand.
     assert!(
-        exact.log2_bytes < 7.0
-            && (6.0..13.0).contains(&free_align.log2_bytes)
-            && icp.log2_bytes > 14.0,
+        exact.log2_bytes.unwrap() < 7.0
+            && (6.0..13.0).contains(&free_align.log2_bytes.unwrap())
+            && icp.log2_bytes.unwrap() > 14.0,
         "{rows:?}"
     );
     assert!(map.success_1m > 0.9 && map.p50_m < gnss.p50_m, "{rows:?}");

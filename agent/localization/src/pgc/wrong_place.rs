@@ -3,6 +3,7 @@
 use std::path::Path;
 
 use protocol::PointCloud;
+use support::statistics;
 
 use super::head_config::SceneHeadConfig;
 use super::head_files::head_config;
@@ -34,13 +35,12 @@ fn config_of(head: &Path) -> Option<SceneHeadConfig> {
 /// The hint that sweeps are those of another LiDAR, if their median number of points is far from that of
 /// the sweeps that the head was made from ([`SceneHeadConfig::sweep_points`]).
 pub fn other_lidar_hint(head_points: Option<usize>, points: &[usize]) -> Option<String> {
-    let mut points = points.to_vec();
-    points.sort_unstable();
-    let (own, of_head) = (*points.get(points.len() / 2)?, head_points?);
-    let ratio = own as f64 / of_head.max(1) as f64;
+    let points: Vec<f64> = points.iter().map(|points| *points as f64).collect();
+    let (own, of_head) = (statistics::median(&points)?, head_points?);
+    let ratio = own / of_head.max(1) as f64;
     (!(LEAST_RATIO..=1.0 / LEAST_RATIO).contains(&ratio)).then(|| {
         format!(
-            "the sweeps have {own} points (median), those that the head was made from {of_head}: for another LiDAR it finds \
+            "the sweeps have {own:.0} points (median), those that the head was made from {of_head}: for another LiDAR it finds \
              few poses, or wrong ones; make a head with this one (agent map)"
         )
     })

@@ -190,18 +190,19 @@ impl TrackedPose {
         }
     }
 
-    /// Corrects the tracker by the pose of a sweep, if it has one.
-    fn correct(&mut self, capture_nanos: u64, localization: &Localization) {
+    /// Corrects the tracker by the pose of a sweep; false if it has none.
+    fn correct(&mut self, capture_nanos: u64, localization: &Localization) -> bool {
         // A pose that the localizer rejects is `found` as well and must not correct the tracker.
         let published = localization.estimate.world_from_cav();
         let Some(found) = published.and(localization.found.as_ref()) else {
-            return;
+            return false;
         };
         let measurement = PoseMeasurement::new(capture_nanos, found);
         match self.tracker.correct(&measurement) {
             Correction::Rejected | Correction::Relocated => self.jumps += 1,
             Correction::Started | Correction::Accepted => {}
         }
+        true
     }
 
     /// Names a speed or a yaw rate that is not used from here on, once.
@@ -220,14 +221,14 @@ impl TrackedPose {
         }
     }
 
-    /// Localizes a vehicle that is lost.
+    /// Localizes a vehicle that is lost, or was found by one pose that no other confirms yet.
     fn start(&mut self, input: &PoseInput<'_>) -> PoseEstimate {
         let Some(localization) = self.measure(input, None) else {
             return no_pose(NoPoseReason::Failed);
         };
-        self.correct(input.capture_nanos, &localization);
-        // Without a pose the tracker has not started: what the localizer gives as the reason is published.
-        match self.tracker.state() {
+        let has_pose = self.correct(input.capture_nanos, &localization);
+        // Without a pose nothing is tracked: what the localizer gives as the reason is published.
+        match self.tracker.state().filter(|_| has_pose) {
             Some(state) => published(&state),
             None if localization.found.is_none_or(|found| found.is_rejected)
                 && self.has_low_coverage(input.capture_nanos) =>
@@ -282,7 +283,7 @@ impl PoseSource for TrackedPose {
         self.sweeps += 1;
         let predicted = self.tracker.predict(input.capture_nanos, &input.motion);
         self.report_refuted(input.cav);
-        let Some(state) = predicted else {
+        let Some(state) = predicted.filter(|_| self.tracker.is_confirmed()) else {
             return self.start(input);
         };
         let place = state.world_from_lidar.translation.vector;
@@ -297,8 +298,12 @@ impl PoseSource for TrackedPose {
             return false;
         };
         let predicted = (!self.is_global_due(input.capture_nanos)).then_some(&state);
-        if let Some(localization) = self.measure(input, predicted) {
-            self.correct(input.capture_nanos, &localization);
+        if let Some(localization) = self.measure(input, predicted)
+            && !self.correct(input.capture_nanos, &localization)
+            && predicted.is_some()
+        {
+            // The prediction may be wrong: the next measurement does not use it.
+            self.global_nanos = None;
         }
         true
     }
@@ -317,7 +322,7 @@ impl PoseSource for TrackedPose {
 
     /// A vehicle that is lost is localized first.
     fn computes_from_sweep(&self) -> bool {
-        self.tracker.state().is_none()
+        !self.tracker.is_confirmed()
     }
 
     fn stages(&self) -> &[StageTiming] {
@@ -568,6 +573,42 @@ mod tests {
             confidence.windows(2).all(|pair| pair[1] < pair[0]),
             "{confidence:?}"
         );
+    }
+
+    #[test]
+    fn a_prediction_without_a_pose_near_it_is_not_used_for_the_next_measurement() {
+        let blind = Road {
+            blind: 10..11,
+            ..road()
+        };
+        let (_, counts) = drive(blind, TrackedPoseConfig::default(), 13);
+        assert_eq!(counts, [3, 5], "whole in the sweeps 0, 1 and 12");
+    }
+
+    #[test]
+    fn one_pose_that_no_other_confirms_is_not_followed() {
+        let wrong = Road {
+            carried_at: 1,
+            ..road()
+        };
+        let (estimates, _) = drive(wrong, TrackedPoseConfig::default(), 10);
+        assert!(x_y(&estimates[0])[1].abs() < 0.1, "{:?}", estimates[0]);
+        assert!(
+            estimates[1..].iter().all(|pose| x_y(pose)[1] > 299.0),
+            "{estimates:?}"
+        );
+        let blind = Road {
+            blind: 1..5,
+            ..road()
+        };
+        let (estimates, _) = drive(blind, TrackedPoseConfig::default(), 10);
+        let has_pose = estimates.iter().map(|pose| pose.world_from_cav().is_some());
+        let without: Vec<usize> = (0..)
+            .zip(has_pose)
+            .filter(|(_, has)| !has)
+            .map(|(sweep, _)| sweep)
+            .collect();
+        assert_eq!(without, [1, 2, 3, 4]);
     }
 
     #[test]

@@ -9,24 +9,28 @@ pub struct MotionContradiction {
     pub of_poses: f64,
 }
 
-/// Contradictions in a row of a measured quantity, over all tracks of a vehicle.
+/// Contradictions of a measured quantity, over all tracks of a vehicle.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Contradictions {
-    in_a_row: u32,
+    /// Their number, less what agreements took off.
+    count: f64,
     pub(super) refuted: Option<MotionContradiction>,
 }
 
 impl Contradictions {
-    /// Counts the comparison of a measured value with that of the poses; `most` contradictions in a row refute it.
-    pub(super) fn count(
-        &mut self,
-        is_contradicted: bool,
-        most: u32,
-        [measured, of_poses]: [f64; 2],
-    ) {
-        self.in_a_row = (self.in_a_row + 1) * u32::from(is_contradicted);
-        if self.in_a_row >= most {
-            self.refuted = Some(MotionContradiction { measured, of_poses });
+    /// Counts the comparison of a measured value with that of the poses: `most` contradictions refute it, of which each
+    /// agreement takes off `relief`.
+    pub(super) fn count(&mut self, is_wrong: bool, [most, relief]: [f64; 2], values: [f64; 2]) {
+        let change = if is_wrong { 1.0 } else { -relief };
+        self.count = (self.count + change).max(0.0);
+        if self.count >= most {
+            self.refute(values);
         }
+    }
+
+    /// The measured value is wrong, at that of the poses; the first such values are kept.
+    pub(super) fn refute(&mut self, [measured, of_poses]: [f64; 2]) {
+        let refuted = MotionContradiction { measured, of_poses };
+        self.refuted.get_or_insert(refuted);
     }
 }

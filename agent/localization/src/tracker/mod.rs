@@ -5,6 +5,7 @@
 //! covariance grows, until the vehicle counts as lost.
 
 mod contradictions;
+mod course;
 mod measurement;
 mod motion_filter;
 mod track;
@@ -14,8 +15,10 @@ use nalgebra::Isometry3;
 use protocol::{EgoMotion, PlanarCovariance};
 
 pub use contradictions::MotionContradiction;
+use course::Course;
 pub use measurement::PoseMeasurement;
 pub(crate) use measurement::unscaled_std;
+use motion_filter::MotionFilter;
 use track::{SpeedTrust, VehicleTrack};
 use yaw_rate_trust::YawRateTrust;
 
@@ -45,7 +48,8 @@ pub struct TrackedState {
 /// Effect of a measurement.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Correction {
-    /// The vehicle was lost: the measurement is its pose.
+    /// The vehicle was lost, its one pose before was not confirmed, or it drives on another course than was taken: the
+    /// measurement is its pose.
     Started,
     /// It corrected the state.
     Accepted,
@@ -56,13 +60,16 @@ pub enum Correction {
 }
 
 /// Follows one vehicle.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Default)]
 pub struct PoseTracker {
     /// Longest time without an accepted measurement, seconds.
     max_coast_s: f64,
     track: Option<VehicleTrack>,
     speed_trust: SpeedTrust,
     yaw_rate_trust: YawRateTrust,
+    course: Course,
+    /// True if two measurements agree on the track.
+    is_confirmed: bool,
     /// Last accepted measurement.
     accepted: Option<PoseMeasurement>,
     /// Rejected measurements in a row that can be reached from each other.
@@ -77,12 +84,7 @@ impl PoseTracker {
     pub fn new(max_coast_s: f64) -> Self {
         Self {
             max_coast_s,
-            track: None,
-            speed_trust: SpeedTrust::default(),
-            yaw_rate_trust: YawRateTrust::default(),
-            accepted: None,
-            rejected: Vec::new(),
-            contradiction: [0.0; 2],
+            ..Self::default()
         }
     }
 
@@ -97,6 +99,7 @@ impl PoseTracker {
             self.track = None;
             self.rejected.clear();
         }
+        self.course.is_backward = motion.speed_mps.is_some_and(|speed| speed < 0.0);
         let track = self.track.as_mut()?;
         let (speed, yaw_rate) = (&mut self.speed_trust, &mut self.yaw_rate_trust);
         track.advance(capture_nanos, motion, speed, yaw_rate);
@@ -138,20 +141,31 @@ impl PoseTracker {
         !self.rejected.is_empty()
     }
 
+    /// True if a pose is tracked that two measurements agree on: one alone may be wrong.
+    pub fn is_confirmed(&self) -> bool {
+        self.track.is_some() && self.is_confirmed
+    }
+
     /// Uses a measurement of the time of the last prediction.
     pub fn correct(&mut self, measurement: &PoseMeasurement) -> Correction {
-        let Some(track) = self.track.as_mut() else {
+        // What another course did to the state is undone.
+        let is_elsewhere = self.course.is_set_by(measurement);
+        let Some(track) = self.track.as_mut().filter(|_| !is_elsewhere) else {
             self.start(measurement);
             return Correction::Started;
         };
-        if track.correct(measurement) {
+        if track.correct(measurement, &mut self.speed_trust) {
             // What a wrong yaw rate did to the state is undone.
             if self.yaw_rate_trust.refutes(measurement) {
                 self.start(measurement);
             }
-            self.accepted = Some(*measurement);
+            (self.accepted, self.is_confirmed) = (Some(*measurement), true);
             self.rejected.clear();
             return Correction::Accepted;
+        }
+        if !self.is_confirmed {
+            self.start(measurement);
+            return Correction::Started;
         }
         let predicted = track.filter.world_from_lidar();
         let off = predicted.inv_mul(&measurement.world_from_lidar);
@@ -164,6 +178,7 @@ impl PoseTracker {
         // No speed follows from the way to a place that a person points at.
         self.accepted = None;
         self.start(stated);
+        self.is_confirmed = true;
     }
 
     fn reject(&mut self, measurement: &PoseMeasurement) -> Correction {
@@ -185,8 +200,14 @@ impl PoseTracker {
     fn start(&mut self, measurement: &PoseMeasurement) {
         let before = self.accepted.replace(*measurement);
         let before = before.filter(|before| can_follow(before, measurement));
-        let speed = before.map(|before| [speed_mps(&before, measurement), SPEED_STD_MPS]);
-        self.track = Some(VehicleTrack::at(measurement, speed));
+        self.is_confirmed = before.is_some();
+        let course_rad = self.course.rad;
+        let speed = before.map(|from| [speed_mps(&from, measurement, course_rad), SPEED_STD_MPS]);
+        let filter = MotionFilter::at(measurement, course_rad, speed);
+        self.track = Some(VehicleTrack {
+            unaided: filter.clone(),
+            filter,
+        });
         self.rejected.clear();
         self.yaw_rate_trust.refutes(measurement);
     }
@@ -201,7 +222,7 @@ impl PoseTracker {
     /// Speed and yaw rate that are not used any more, since measured poses contradict them.
     pub fn refuted(&self) -> [Option<MotionContradiction>; 2] {
         let yaw_rate = &self.yaw_rate_trust.contradictions;
-        [self.speed_trust.0.refuted, yaw_rate.refuted]
+        [self.speed_trust.contradictions.refuted, yaw_rate.refuted]
     }
 }
 
@@ -218,11 +239,12 @@ fn can_follow(from: &PoseMeasurement, to: &PoseMeasurement) -> bool {
     time_s > 0.0 && time_s <= SPEED_BASE_S && off.norm() <= SLACK_M + MAX_SPEED_MPS * time_s
 }
 
-/// Speed along the heading from one pose to the next, metres per second.
-fn speed_mps(from: &PoseMeasurement, to: &PoseMeasurement) -> f64 {
+/// Speed from one pose to the next along the course (radians) at the earlier one, metres per second: reversing is negative.
+fn speed_mps(from: &PoseMeasurement, to: &PoseMeasurement, course_rad: f64) -> f64 {
     let moved = from.world_from_lidar.inv_mul(&to.world_from_lidar);
-    // Along the heading of the earlier pose: x is ahead, and reversing is negative.
-    moved.translation.x / seconds(from.capture_nanos, to.capture_nanos).max(1e-3)
+    let (sin, cos) = course_rad.sin_cos();
+    let ahead_m = moved.translation.x * cos + moved.translation.y * sin;
+    ahead_m / seconds(from.capture_nanos, to.capture_nanos).max(1e-3)
 }
 
 #[cfg(test)]

@@ -1,7 +1,8 @@
 //! Motion filter: extended Kalman filter of a vehicle that turns at a constant rate (CTRV), and of its height.
 //!
-//! Three constants of the vehicle are states too: the bias of its gyroscope, the scale of its speed, and the place of the LiDAR ahead of the point
-//! that moves straight along the heading (the middle of the rear axle), which swings the LiDAR sideways in a turn.
+//! Four constants of the vehicle are states too: the bias of its gyroscope, the scale of its speed, the course (the direction
+//! of travel in the LiDAR's frame), and the place of the LiDAR ahead of the point that moves straight along the course (the
+//! middle of the rear axle), which swings the LiDAR sideways in a turn.
 
 use std::f64::consts::{PI, TAU};
 
@@ -39,6 +40,8 @@ pub(super) const BIAS_STD: f64 = 0.01;
 const BIAS_DRIFT_STD: f64 = 0.0002;
 /// Standard deviation of the LiDAR's unknown place ahead of the rear axle, metres.
 const LEVER_STD_M: f64 = 1.5;
+/// Standard deviation of the course from the one a track begins with, radians: a LiDAR that is mounted not quite straight.
+const COURSE_STD_RAD: f64 = 0.1;
 /// Standard deviation of the unknown speed and yaw rate at the first pose, metres and radians per second.
 const FIRST_STD: [f64; 2] = [15.0, 0.3];
 /// Time after which roll and pitch are those of later measurements by 63 %, seconds.
@@ -53,7 +56,8 @@ const YAW_RATE: usize = 4;
 const BIAS: usize = 5;
 const LEVER: usize = 6;
 const SCALE: usize = 7;
-const STATES: usize = 8;
+const COURSE: usize = 8;
+const STATES: usize = 9;
 
 type CavState = SVector<f64, STATES>;
 type Covariance = SMatrix<f64, STATES, STATES>;
@@ -63,9 +67,9 @@ type Covariance = SMatrix<f64, STATES, STATES>;
 pub(super) struct MotionFilter {
     /// Capture time of the state, nanoseconds.
     pub(super) capture_nanos: u64,
-    /// x, y (metres, world) and yaw (radians) of the LiDAR, speed along the heading (m/s), yaw rate (rad/s), bias of the
-    /// gyroscope (rad/s), the LiDAR's place ahead of the rear axle (metres), and the share of the measured speed by which
-    /// the true one exceeds it.
+    /// x, y (metres, world) and yaw (radians) of the LiDAR, speed along the course (m/s), yaw rate (rad/s), bias of the
+    /// gyroscope (rad/s), the LiDAR's place ahead of the rear axle (metres), the share of the measured speed by which the
+    /// true one exceeds it, and the course (radians from the LiDAR's x axis).
     state: CavState,
     covariance: Covariance,
     /// Height (metres, world) and vertical speed beside that of the slope (m/s).
@@ -78,24 +82,31 @@ pub(super) struct MotionFilter {
 }
 
 impl MotionFilter {
-    /// State of a vehicle at its first pose, at any speed.
-    pub(super) fn at(measurement: &PoseMeasurement) -> Self {
+    /// State of a vehicle at its first pose, on about this course (radians), at a speed with its standard deviation (metres
+    /// per second) or at any.
+    pub(super) fn at(
+        measurement: &PoseMeasurement,
+        course_rad: f64,
+        speed_mps: Option<[f64; 2]>,
+    ) -> Self {
         let [x, y, z] = measurement.world_from_lidar.translation.vector.data.0[0];
         let (roll_rad, pitch_rad, yaw) = measurement.world_from_lidar.rotation.euler_angles();
-        let (position, [speed, yaw_rate]) = (measurement.position_std_m, FIRST_STD);
+        let (position, [speed_std, yaw_rate_std]) = (measurement.position_std_m, FIRST_STD);
+        let [speed, speed_std] = speed_mps.unwrap_or([0.0, speed_std]);
         let std = CavState::from([
             position,
             position,
             measurement.yaw_std_rad,
-            speed,
-            yaw_rate,
+            speed_std,
+            yaw_rate_std,
             BIAS_STD,
             LEVER_STD_M,
             SCALE_STD,
+            COURSE_STD_RAD,
         ]);
         Self {
             capture_nanos: measurement.capture_nanos,
-            state: CavState::from([x, y, yaw, 0.0, 0.0, 0.0, 0.0, 0.0]),
+            state: CavState::from([x, y, yaw, speed, 0.0, 0.0, 0.0, 0.0, course_rad]),
             covariance: Covariance::from_diagonal(&std.component_mul(&std)),
             height: Vector2::new(z, 0.0),
             height_covariance: Matrix2::new(position * position, 0.0, 0.0, 1.0),
@@ -128,19 +139,21 @@ impl MotionFilter {
     }
 
     fn advance_plane(&mut self, time_s: f64, yaw_acceleration_std: f64) {
-        let [_, _, yaw, speed, yaw_rate, _, lever_m, _] = self.state.data.0[0];
-        // Midpoint rule: the heading half way.
-        let (sin, cos) = (yaw + yaw_rate * time_s / 2.0).sin_cos();
+        let [_, _, yaw, speed, yaw_rate, _, lever_m, _, course] = self.state.data.0[0];
+        // Midpoint rule: the direction of travel half way.
+        let (sin, cos) = (yaw + course + yaw_rate * time_s / 2.0).sin_cos();
         let (ahead_m, aside_m) = (speed * time_s, lever_m * yaw_rate * time_s);
         let [moved_x, moved_y] = [ahead_m * cos - aside_m * sin, ahead_m * sin + aside_m * cos];
         self.state[X] += moved_x;
         self.state[Y] += moved_y;
         self.state[YAW] = wrapped_rad(yaw + yaw_rate * time_s);
 
-        // Step: Jacobian of the motion. The yaw rate enters the heading half way with half of the time.
+        // Step: Jacobian of the motion. The yaw rate enters the direction half way with half of the time.
         let mut step = Covariance::identity();
-        step[(X, YAW)] = -moved_y;
-        step[(Y, YAW)] = moved_x;
+        for direction in [YAW, COURSE] {
+            step[(X, direction)] = -moved_y;
+            step[(Y, direction)] = moved_x;
+        }
         step[(X, SPEED)] = time_s * cos;
         step[(Y, SPEED)] = time_s * sin;
         step[(X, YAW_RATE)] = (-moved_y / 2.0 - lever_m * sin) * time_s;
@@ -151,13 +164,13 @@ impl MotionFilter {
         let half_square = time_s * time_s / 2.0;
         // Step: process noise. An acceleration is constant within a step: its effects are fully correlated.
         let (push_x, push_y) = (half_square * cos, half_square * sin);
-        let pushed =
-            CavState::from([push_x, push_y, 0.0, time_s, 0.0, 0.0, 0.0, 0.0]) * ACCELERATION_STD;
-        let turned = CavState::from([0.0, 0.0, half_square, 0.0, time_s, 0.0, 0.0, 0.0])
-            * yaw_acceleration_std;
+        let spread = |x, y, yaw, speed, yaw_rate| {
+            CavState::from([x, y, yaw, speed, yaw_rate, 0.0, 0.0, 0.0, 0.0])
+        };
+        let pushed = spread(push_x, push_y, 0.0, time_s, 0.0) * ACCELERATION_STD;
+        let turned = spread(0.0, 0.0, half_square, 0.0, time_s) * yaw_acceleration_std;
         // A random walk: its variance, not its deviation, grows with time.
-        let slipped =
-            CavState::from([-sin, cos, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]) * SLIP_STD_M * time_s.sqrt();
+        let slipped = spread(-sin, cos, 0.0, 0.0, 0.0) * SLIP_STD_M * time_s.sqrt();
         self.covariance = step * self.covariance * step.transpose()
             + pushed * pushed.transpose()
             + turned * turned.transpose()
@@ -169,8 +182,9 @@ impl MotionFilter {
     fn advance_height(&mut self, time_s: f64) {
         let step = Matrix2::new(1.0, time_s, 0.0, 1.0);
         let lifted = Vector2::new(time_s * time_s / 2.0, time_s) * VERTICAL_ACCELERATION_STD;
-        // Nose down is a positive pitch.
-        let climbed_m = -self.state[SPEED] * self.pitch_rad.sin() * time_s;
+        let (sin, cos) = self.state[COURSE].sin_cos();
+        let ahead = self.world_from_lidar().rotation * Vector3::new(cos, sin, 0.0);
+        let climbed_m = self.state[SPEED] * ahead.z * time_s;
         self.height = step * self.height + Vector2::new(climbed_m, 0.0);
         self.height_covariance =
             step * self.height_covariance * step.transpose() + lifted * lifted.transpose();
@@ -209,12 +223,12 @@ impl MotionFilter {
         (off, variance, selects)
     }
 
-    /// Squared Mahalanobis distance between a pose of the same time and the state: x, y and yaw.
+    /// Squared Mahalanobis distance between a pose and the state: x, y and yaw. Infinite at another time.
     pub(super) fn distance_squared(&self, measurement: &PoseMeasurement) -> f64 {
         let (off, spread) = self.innovation(measurement);
-        spread
-            .cholesky()
-            .map_or(f64::INFINITY, |factor| off.dot(&factor.solve(&off)))
+        let is_now = self.capture_nanos == measurement.capture_nanos;
+        let factor = spread.cholesky().filter(|_| is_now);
+        factor.map_or(f64::INFINITY, |factor| off.dot(&factor.solve(&off)))
     }
 
     /// Uses a pose of the same time.
@@ -244,12 +258,6 @@ impl MotionFilter {
         self.measured_nanos = measurement.capture_nanos;
     }
 
-    /// Sets a speed that is known from elsewhere, metres per second.
-    pub(super) fn set_speed(&mut self, speed_mps: f64, std_mps: f64) {
-        self.state[SPEED] = speed_mps;
-        self.covariance[(SPEED, SPEED)] = std_mps * std_mps;
-    }
-
     /// Pose of the state.
     pub(super) fn world_from_lidar(&self) -> Isometry3<f64> {
         let position = Translation3::new(self.state[X], self.state[Y], self.height[0]);
@@ -268,7 +276,7 @@ impl MotionFilter {
         }
     }
 
-    /// Speed along the heading, metres per second.
+    /// Speed along the course, metres per second.
     pub(super) fn speed_mps(&self) -> f64 {
         self.state[SPEED]
     }

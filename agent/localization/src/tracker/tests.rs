@@ -50,11 +50,20 @@ fn motion(sweep: u64, bias_rad_s: f64) -> EgoMotion {
 /// Largest position error (metres) and yaw error (radians) of the predictions of sweeps 60 to 200, a fourth of which are
 /// measured, of a LiDAR ahead of the rear axle.
 fn worst(motion: impl Fn(u64) -> EgoMotion, lever_m: f64) -> [f64; 2] {
+    let lever = Translation3::new(lever_m, 0.0, 0.0);
+    worst_at(motion, |sweep| truth(sweep) * lever)
+}
+
+/// The same of a LiDAR at these poses.
+fn worst_at(
+    motion: impl Fn(u64) -> EgoMotion,
+    world_from_lidar: impl Fn(u64) -> Isometry3<f64>,
+) -> [f64; 2] {
     let mut tracker = PoseTracker::new(MAX_COAST_S);
     let mut worst: [f64; 2] = [0.0; 2];
     for sweep in 0..200 {
         let state = tracker.predict(sweep * TENTH_NANOS, &motion(sweep));
-        let world_from_lidar = truth(sweep) * Translation3::new(lever_m, 0.0, 0.0);
+        let world_from_lidar = world_from_lidar(sweep);
         if let Some(state) = state.filter(|_| sweep >= 60) {
             let off = world_from_lidar.inv_mul(&state.world_from_lidar);
             worst = [
@@ -179,6 +188,69 @@ fn a_lidar_ahead_of_the_rear_axle_is_swung_aside_in_bends() {
     let [off_m, off_rad] = worst(|sweep| motion(sweep, 0.0), 2.0);
     // Without the lever: 0.3 rad/s at 2 m for 0.4 s are 0.24 m.
     assert!(off_m < 0.04 && off_rad < 0.002, "{off_m} m, {off_rad} rad");
+}
+
+#[test]
+fn a_turned_lidar_is_followed_ahead_and_in_reverse() {
+    let reversing = |sweep: u64| EgoMotion {
+        speed_mps: Some(-10.0),
+        yaw_rate_rad_s: motion(201 - sweep, 0.0).yaw_rate_rad_s.map(|rate| -rate),
+    };
+    for degrees in [4.0_f64, 20.0, 90.0] {
+        let turn = UnitQuaternion::from_euler_angles(0.0, 0.0, degrees.to_radians());
+        let [ahead_m, _] = worst_at(|sweep| motion(sweep, 0.0), |sweep| truth(sweep) * turn);
+        let [reverse_m, _] = worst_at(reversing, |sweep| truth(200 - sweep) * turn);
+        assert!(
+            ahead_m < 0.03 && reverse_m < 0.03,
+            "{degrees} degrees: {ahead_m} m, in reverse {reverse_m} m"
+        );
+    }
+}
+
+/// Tracker after thirty seconds at changing speed through turns, with a speed and a yaw rate of some sweeps before.
+fn driven_late([speed_late, yaw_rate_late]: [u64; 2]) -> PoseTracker {
+    let speed_mps = |sweep: u64| 8.0 + 4.0 * (0.06 * sweep as f64).sin();
+    let yaw_rate_rad_s = |sweep: u64| if sweep % 50 < 15 { 0.4 } else { 0.0 };
+    let mut random = ChaCha8Rng::seed_from_u64(1);
+    let noise = Normal::new(0.0, 0.03).unwrap();
+    let mut tracker = PoseTracker::new(MAX_COAST_S);
+    let mut pose = Isometry3::identity();
+    for sweep in 0..300_u64 {
+        pose.rotation *= UnitQuaternion::from_euler_angles(0.0, 0.0, 0.1 * yaw_rate_rad_s(sweep));
+        pose *= Translation3::new(0.1 * speed_mps(sweep), 0.0, 0.0);
+        let motion = EgoMotion {
+            speed_mps: Some(speed_mps(sweep.saturating_sub(speed_late))),
+            yaw_rate_rad_s: Some(yaw_rate_rad_s(sweep.saturating_sub(yaw_rate_late))),
+        };
+        tracker.predict(sweep * TENTH_NANOS, &motion);
+        if sweep % 4 == 0 || tracker.needs_measurement() {
+            let mut world_from_lidar = pose;
+            world_from_lidar.translation.x += noise.sample(&mut random);
+            world_from_lidar.translation.y += noise.sample(&mut random);
+            tracker.correct(&PoseMeasurement {
+                world_from_lidar,
+                ..measured(sweep, [0.0; 2], 0.03)
+            });
+        }
+    }
+    tracker
+}
+
+#[test]
+fn a_late_speed_and_a_late_yaw_rate_are_named_and_not_used() {
+    for (late, is_refuted) in [
+        ([0, 0], [false, false]),
+        ([1, 0], [false, false]),
+        ([10, 0], [true, false]),
+        ([0, 3], [false, true]),
+    ] {
+        let refuted = driven_late(late).refuted();
+        assert_eq!(
+            refuted.map(|of| of.is_some()),
+            is_refuted,
+            "{late:?} sweeps late: {refuted:?}"
+        );
+    }
 }
 
 #[test]

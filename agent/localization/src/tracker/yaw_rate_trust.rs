@@ -9,8 +9,9 @@ use super::seconds;
 const LEAST_TIME_S: f64 = 0.25;
 /// Standard deviations beyond which two turns contradict each other.
 const GATE_STD: f64 = 4.0;
-/// Contradictions in a row after which a yaw rate is not used any more: one wrong pose makes two.
-const MOST_CONTRADICTIONS: u32 = 3;
+/// Contradictions after which a yaw rate is not used any more, since one wrong pose makes two, and what an agreement takes
+/// off: a late rate is wrong at both ends of a turn and right between.
+const MOST_CONTRADICTIONS: [f64; 2] = [3.0, 0.5];
 
 /// Trust in a yaw rate, over all tracks of a vehicle.
 #[derive(Debug, Clone, Default)]
@@ -52,11 +53,14 @@ impl YawRateTrust {
         let residual_rad = RESIDUAL_YAW_ACCELERATION_STD * time_s * step_s / 2.0;
         let stds = [from.yaw_std_rad, pose.yaw_std_rad, drift_rad, residual_rad];
         let variance = stds.iter().map(|std| std * std).sum::<f64>();
-        let off_rad = wrapped_rad(turned_rad - measured_rad).abs();
-        let is_contradicted = off_rad > GATE_STD * variance.sqrt();
-        let rates = [measured_rad, turned_rad].map(|turn_rad| turn_rad / time_s);
-        self.contradictions
-            .count(is_contradicted, MOST_CONTRADICTIONS, rates);
+        let gate_rad = GATE_STD * variance.sqrt();
+        let is_contradicted = wrapped_rad(turned_rad - measured_rad).abs() > gate_rad;
+        // On a straight a late rate agrees as well: that says nothing.
+        if is_contradicted || turned_rad.abs().max(measured_rad.abs()) > gate_rad {
+            let rates = [measured_rad, turned_rad].map(|turn_rad| turn_rad / time_s);
+            self.contradictions
+                .count(is_contradicted, MOST_CONTRADICTIONS, rates);
+        }
         self.contradictions.refuted.is_some()
     }
 }

@@ -42,7 +42,7 @@ use support::output;
 use support::provenance::Provenance;
 use terminal::progress;
 
-use super::retrieval::{self, RetrievalBy, shown_on};
+use super::retrieval::{self, RetrievalBy};
 use super::scene_heads::{
     SceneHeadFile, by_head, check_place, generated_maps, is_elsewhere, surfel_map, with_files,
 };
@@ -407,7 +407,7 @@ impl Args {
             sweeps: self.sweeps.map(|count| count as usize),
         };
         let bar = progress::bar(0, "sweeps");
-        let mut on_sweep = shown_on(&bar);
+        let mut on_sweep = progress::shown_on(&bar);
         let evaluated = match subject {
             Subject::Localizer(mut localizer) => evaluate(&mut *localizer, &options, &mut on_sweep),
             Subject::Source(mut source) => evaluate_source(&mut *source, &options, &mut on_sweep),

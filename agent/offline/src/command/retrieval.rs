@@ -5,7 +5,6 @@ use std::path::PathBuf;
 use agent_offline::Error;
 use agent_offline::sweep_database::described_sweeps;
 use dataset::LeftOut;
-use indicatif::ProgressBar;
 use localization::baselines::{DescribePolar, PolarRetrieval, Retrieval, SweepDatabase};
 use localization::pgc::{Localize, Localizer, LocalizerError, stopwatch};
 use nalgebra::Isometry3;
@@ -72,14 +71,7 @@ fn described<D, E: Into<LocalizerError>>(
     mut describe: impl FnMut(&PointCloud) -> Result<Option<D>, E>,
 ) -> Result<Vec<(D, Isometry3<f64>)>, BadInput> {
     let bar = progress::bar(0, "sweeps described");
-    let sweeps = described_sweeps(folders, &mut describe, left_out, &mut shown_on(&bar));
+    let mut on_sweep = progress::shown_on(&bar);
+    let sweeps = described_sweeps(folders, &mut describe, left_out, &mut on_sweep);
     sweeps.map_err(BadInput::of)
-}
-
-/// Shows the number done and that of all on a bar; the bar is cleared when it is dropped.
-pub(super) fn shown_on(bar: &ProgressBar) -> impl FnMut(usize, usize) {
-    move |done, all| {
-        bar.set_length(all as u64);
-        bar.set_position(done as u64);
-    }
 }

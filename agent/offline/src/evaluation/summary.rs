@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use serde::Serialize;
-use support::statistics::{mean, median, quantile, sorted};
+use support::statistics::{SUCCESS_M, mean, median, quantile, share_below, sorted};
 
 use super::{EvaluatedSweep, outcome};
 use figures::{Axis, Chart, Mark, Series};
@@ -134,10 +134,8 @@ impl LocalizationSummary {
             .map(|error| (error.distance_m, error.angle_deg))
             .unzip();
         let (metres, degrees) = (sorted(&metres), sorted(&degrees));
-        let [success_3m, success_1m] = [3.0, 1.0].map(|limit_m: f64| {
-            let good = metres.iter().filter(|&&error_m| error_m < limit_m);
-            good.count() as f64 / sweeps.len().max(1) as f64
-        });
+        let [success_3m, success_1m] =
+            [SUCCESS_M, 1.0].map(|limit_m| share_below(&metres, limit_m, sweeps.len()));
         let judged = judged(sweeps);
         let sigmas = each(&judged, |(found, _)| found.sigma);
         let ratios = each(&judged, |(found, _)| found.evidence.inlier_ratio);

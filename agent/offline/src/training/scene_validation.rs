@@ -92,10 +92,8 @@ pub(super) fn validate(
         translations.push(metres);
         rotations.push(degrees);
     }
-    let [success_3m, success_1m] = [3.0, 1.0].map(|limit: f64| {
-        let successes = translations.iter().filter(|&&error| error < limit);
-        successes.count() as f64 / translations.len() as f64
-    });
+    let [success_3m, success_1m] = [statistics::SUCCESS_M, 1.0]
+        .map(|limit_m| statistics::share_below(&translations, limit_m, translations.len()));
     Ok(SceneAccuracy {
         cell_p50_m: median(&cell_errors),
         pose_p50_m: median(&translations),

@@ -3,6 +3,10 @@
 //! The order and the limits are those of the reference library (spconv's CPU generator): pillars are numbered by their
 //! first point, the first points of a pillar and the first pillars of a sweep are kept.
 
+use std::sync::Once;
+
+use support::output;
+
 use crate::model_config::DetectorConfig;
 
 /// Mark of a cell that has no pillar yet, and of a point that was dropped.
@@ -55,6 +59,8 @@ pub struct Voxeliser {
     pillar_of_cell: Vec<u32>,
     /// Pillar of each point of the sweep.
     pillar_of_point: Vec<u32>,
+    /// Points of the sweep in cells beyond the last pillar.
+    points_beyond: usize,
 }
 
 impl Voxeliser {
@@ -69,13 +75,16 @@ impl Voxeliser {
             max_pillars: config.max_pillars,
             pillar_of_cell: vec![NONE; grid.iter().product()],
             pillar_of_point: Vec::new(),
+            points_beyond: 0,
         }
     }
 
     /// Sorts the points of one sweep into pillars; points outside the area and points that are not finite are dropped.
+    /// Points beyond the last pillar too, and the first sweep of the process that has such is named.
     pub fn voxelise(&mut self, points: &[[f32; 4]]) -> Pillars {
         // First pass: the pillar of every point, and the counts and coordinates of the pillars.
         let mut pillars = Pillars::default();
+        self.points_beyond = 0;
         self.pillar_of_point.clear();
         self.pillar_of_point.reserve(points.len());
         for point in points {
@@ -86,6 +95,15 @@ impl Voxeliser {
             self.pillar_of_point.push(pillar);
         }
         self.gather(points, &mut pillars);
+        if self.points_beyond > 0 {
+            static NAMED: Once = Once::new();
+            let (beyond, most) = (self.points_beyond, self.max_pillars);
+            NAMED.call_once(|| {
+                output::note(format_args!(
+                    "{beyond} points of a sweep are beyond {most} pillars (max_pillars): left out"
+                ));
+            });
+        }
         // Only cells with a pillar are reset, not the whole grid.
         for coord in &pillars.coords {
             let [z, y, x] = coord.map(|index| index as usize);
@@ -117,6 +135,7 @@ impl Voxeliser {
         if pillar == NONE {
             // No new pillar, but those that exist still take points.
             if pillars.len() >= self.max_pillars {
+                self.points_beyond += 1;
                 return NONE;
             }
             pillar = pillars.len() as u32;
@@ -195,11 +214,15 @@ mod tests {
     fn full_pillars_and_full_sweeps_drop_the_late_points() {
         let a = [0.5, 0.5, 0.0, 0.0];
         let b = [1.5, 0.5, 0.0, 0.0];
-        let pillars = voxeliser(2, 1).voxelise(&[a, b, a, a]);
+        let mut voxeliser = voxeliser(2, 1);
+        let pillars = voxeliser.voxelise(&[a, b, a, a]);
         assert_eq!(
             (pillars.counts.as_slice(), pillars.points.len()),
             ([2].as_slice(), 2)
         );
+        assert_eq!(voxeliser.points_beyond, 1, "a full pillar is usual");
+        voxeliser.voxelise(&[a]);
+        assert_eq!(voxeliser.points_beyond, 0, "counted per sweep");
     }
 
     #[test]

@@ -63,7 +63,7 @@ pub(crate) const MAX_BYTES: u64 = 4 << 30;
 impl Weights {
     /// Reads a whole file.
     ///
-    /// Integer tensors, which only count batches in the reference, are ignored.
+    /// Tensors of 64-bit integers, which only count batches in the reference, are ignored.
     ///
     /// # Errors
     /// [`FileError`] when the file is missing, truncated, or holds values that are no parameters.
@@ -278,7 +278,7 @@ pub fn parsed(bytes: &[u8]) -> Result<(HashMap<String, String>, SafeTensors<'_>)
     Ok((header.metadata().clone().unwrap_or_default(), tensors))
 }
 
-/// The values of one tensor as `f32`; `None` for integers.
+/// The values of one tensor as `f32`; `None` for 64-bit integers.
 fn read_values(path: &Path, name: &str, view: &TensorView<'_>) -> Result<Option<Vec<f32>>> {
     let data = view.data();
     let values: Vec<f32> = match view.dtype() {
@@ -287,7 +287,7 @@ fn read_values(path: &Path, name: &str, view: &TensorView<'_>) -> Result<Option<
         Dtype::F32 => numbers(data, f32::from_le_bytes),
         // Beyond the range of `f32` it becomes infinite, which the check below refuses.
         Dtype::F64 => numbers(data, |bytes| f64::from_le_bytes(bytes) as f32),
-        Dtype::I64 | Dtype::I32 => return Ok(None),
+        Dtype::I64 => return Ok(None),
         dtype => {
             let problem = format_args!(
                 "tensor {name:?} is of type {dtype:?}; parameters are F16, BF16, F32 or F64"
@@ -527,6 +527,33 @@ mod tests {
         let message = Weights::load(&path).unwrap_err().to_string();
         let expected = format!("tensor {name:?} holds -0.25 at index 3");
         assert!(message.contains(&expected), "{message}");
+    }
+
+    #[test]
+    fn a_parameter_of_32_bit_integers_is_refused_with_its_type() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("int.safetensors");
+        save(
+            &path,
+            &network(&small()),
+            &metadata(&small()),
+            Precision::Single,
+        )
+        .unwrap();
+        // The type of the first tensor of the header.
+        let bytes = std::fs::read(&path).unwrap();
+        let at = bytes
+            .windows(5)
+            .position(|part| part == b"\"F32\"")
+            .unwrap();
+        let mut changed = bytes;
+        changed[at + 1] = b'I';
+        std::fs::write(&path, changed).unwrap();
+        let message = Weights::load(&path).unwrap_err().to_string();
+        assert!(
+            message.contains("is of type I32; parameters are"),
+            "{message}"
+        );
     }
 
     #[test]

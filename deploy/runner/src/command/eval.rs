@@ -24,6 +24,7 @@ use runner::experiment::spec::Experiment;
 use runner::experiment::table;
 use support::file_error::FileError;
 use support::output;
+use support::sampling::repeated;
 use terminal::progress;
 use training::feature_store::KeptMaps;
 
@@ -208,12 +209,11 @@ impl Arguments {
     fn trial(&self) -> Result<Trial, BadInput> {
         self.pose.0.validate().map_err(BadInput::of)?;
         self.codec.0.validate().map_err(BadInput::of)?;
-        if self.rate.0.watch_queue && !self.emulates_link() {
-            let reason = "--watch-queue: without --link there is no queue to watch";
+        if self.rate.0.watch_queue {
+            let reason = "--watch-queue: no map waits in the queue of an agent in an evaluation";
             return Err(BadInput::new(reason));
         }
-        let mut methods = self.method.iter().enumerate();
-        if let Some((_, twice)) = methods.find(|(place, one)| self.method[..*place].contains(one)) {
+        if let Some(twice) = repeated(&self.method) {
             return Err(BadInput::new(format!("--method names {twice} twice")));
         }
         let intensity_scale = self.intensity.scale;
@@ -275,6 +275,10 @@ impl Arguments {
         }
         if let Some(latency_ms) = self.latency_ms {
             link.config.latency = LatencyModel::ConstantMs(latency_ms);
+        }
+        if self.bandwidth_mbps.is_some() && link.config.latency.has_rate() {
+            let rule = "--bandwidth-mbps: the latency of link MODEL has a rate of its own; add --latency-ms";
+            return Err(BadInput::new(rule.replace("MODEL", model)));
         }
         link.config.validate().map_err(BadInput::of)?;
         Ok(link)

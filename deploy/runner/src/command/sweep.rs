@@ -65,11 +65,11 @@ impl Arguments {
             return Ok(Outcome::Done);
         }
         if let Some(slice) = self.slices.slice()? {
-            sweep.run_slice(slice, jobs).map_err(blamed)?;
+            let cells = sweep.run_slice(slice, jobs).map_err(blamed)?;
             output::note(format_args!(
                 "slice {slice} is computed; without --slice, this command writes the table"
             ));
-            return Ok(Outcome::Done);
+            return Ok(left_out(cells.iter().map(|cell| &cell.metrics.left_out)));
         }
         let (table, runs) = sweep.run(jobs, self.keep_feature_maps).map_err(blamed)?;
         match self.json {

@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+use dataset::evaluation_protocol::fewer;
 use fusion::Method;
 use protocol::RunId;
 use runner::experiment::report;
@@ -78,7 +79,7 @@ impl Arguments {
         let result = run_scenario(&scenario, &options)?;
         let is_whole = !scenario.scene.repeat && !result.interrupted;
         let asked = scenario.scene.frames.filter(|_| is_whole);
-        let fewer = report::fewer_frames(result.metrics.ticks as usize, asked);
+        let fewer = fewer("frames", result.metrics.ticks as usize, asked);
         fewer.into_iter().for_each(output::note);
         if self.json {
             output::line(serde_json::to_string_pretty(&result.metrics)?)?;

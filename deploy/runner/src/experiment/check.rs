@@ -2,6 +2,7 @@
 
 use std::fmt::Debug;
 
+use agent::config::SentBoxes;
 use anyhow::{Result, anyhow, bail, ensure};
 use ego_fuser::config::EgoSettings;
 use ego_fuser_offline::evaluation::stepped::ComputeTimes;
@@ -170,6 +171,9 @@ fn axes(grid: &Grid) -> Result<()> {
     let all = [&grid.method[..], &grid.reference].concat();
     values("grid.method with grid.reference", Some(&all), |_| Ok(()))?;
     values("grid.codec", grid.codec.as_ref(), codec)?;
+    let codecs = grid.codec.iter().flatten();
+    let alone = codecs.filter(|codec| codec.boxes == Some(SentBoxes::Only));
+    ensure!(alone.count() <= 1, "grid.codec names boxes: only twice");
     numbers("grid.latency_ms", &grid.latency_ms, 0.0, 600_000.0)?;
     numbers("grid.jitter_ms", &grid.jitter_ms, 0.0, 600_000.0)?;
     // Infinity stands for an unlimited link; the highest rate of a limited one is the link's own rule.
@@ -192,7 +196,13 @@ fn codec(codec: &CodecSpec) -> Result<()> {
     number("grid.codec: keep", codec.keep.unwrap_or(1.0), 1e-6, 1.0)?;
     number("grid.codec: fit", codec.fit.unwrap_or(1.0), 0.01, 1.0)?;
     let level = f64::from(codec.zstd_level.unwrap_or(1));
-    number("grid.codec: zstd_level", level, 1.0, 22.0)
+    number("grid.codec: zstd_level", level, 1.0, 22.0)?;
+    let has_options = (codec.keep, codec.zstd_level, codec.fit) != (None, None, None);
+    ensure!(
+        codec.boxes != Some(SentBoxes::Only) || !has_options,
+        "grid.codec: keep, zstd_level and fit are for feature maps, but boxes is only"
+    );
+    Ok(())
 }
 
 /// Checks an axis of numbers from `low` to `high`.
@@ -256,16 +266,18 @@ fn contradictions(experiment: &Experiment, link: &LinkConfig) -> Result<()> {
 /// Contradictions between the axes of a link, its own settings, and the times of the ego.
 fn link_axes(experiment: &Experiment, link: &LinkConfig) -> Result<()> {
     let (grid, ego) = (&experiment.grid, &experiment.ego);
-    let has_latency = link.latency != LatencyModel::None;
+    let varies_rate = grid.bandwidth_mbps.is_some();
+    let has_latency = grid.latency_ms.is_some() && link.latency != LatencyModel::None;
+    let has_loss = grid.loss.is_some() && link.loss != LossModel::None;
+    let is_serialised = link.latency.has_rate();
     let has_capacity = link.capacity != CapacityConfig::Unlimited;
-    let twice = if grid.latency_ms.is_some() && has_latency {
-        Some(["latency_ms", "latency"])
-    } else if grid.bandwidth_mbps.is_some() && has_capacity {
-        Some(["bandwidth_mbps", "capacity"])
-    } else {
-        (grid.loss.is_some() && link.loss != LossModel::None).then_some(["loss", "loss"])
-    };
-    if let Some([axis, field]) = twice {
+    let twice = [
+        (has_latency, "latency_ms", "latency"),
+        (varies_rate && has_capacity, "bandwidth_mbps", "capacity"),
+        (varies_rate && is_serialised, "bandwidth_mbps", "latency"),
+        (has_loss, "loss", "loss"),
+    ];
+    if let Some((_, axis, field)) = twice.into_iter().find(|(is_twice, ..)| *is_twice) {
         let name = experiment.link.as_deref().unwrap_or_default();
         bail!("grid.{axis} and the {field} of link {name} contradict each other");
     }
@@ -389,6 +401,18 @@ mod tests {
             (
                 "link: dsrc\ngrid: {method: [max], bandwidth_mbps: [6]}",
                 "capacity of link dsrc",
+            ),
+            (
+                "link: opencood-real\ngrid: {method: [max], bandwidth_mbps: [6]}",
+                "grid.bandwidth_mbps and the latency of link opencood-real",
+            ),
+            (
+                "grid: {method: [max], codec: [{dtype: i8, boxes: only, keep: 0.1}]}",
+                "grid.codec: keep, zstd_level and fit are for feature maps, but boxes is only",
+            ),
+            (
+                "grid: {method: [max], codec: [{dtype: i8, boxes: only}, {dtype: f32, boxes: only}]}",
+                "grid.codec names boxes: only twice",
             ),
             ("link: nowhere\ngrid: {method: [max]}", "nowhere"),
             (

@@ -1,17 +1,16 @@
 //! Evaluation of one cell of an experiment: a method on recorded scenes, with or without link emulation.
 
-use std::collections::{BTreeMap, HashSet};
+use std::collections::BTreeMap;
 use std::fs;
-use std::ops::ControlFlow;
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex};
 use std::time::Instant;
 
 use agent::attack::Falsification;
-use agent::config::AgentSettings;
+use agent::config::{AgentSettings, SentBoxes};
 use agent::rate::RateConfig;
-use anyhow::{Context, Result, anyhow, bail, ensure};
-use dataset::evaluation_protocol::{EvaluationProtocol, ProtocolConfig};
+use anyhow::{Context, Result, bail, ensure};
+use dataset::evaluation_protocol::{EvaluationProtocol, ProtocolConfig, lacking};
 use dataset::{self, IntensityScale, OpenOptions, ReadError, Scenario, findings};
 use deploy::score::FrameScores;
 use deploy::score::metrics::{Messages, Metrics};
@@ -31,7 +30,6 @@ use crate::cached_poses;
 use crate::evaluated_frame::{judge, metrics};
 use crate::experiment::cell::{Cell, CellKey};
 use crate::experiment::frame_files;
-use crate::experiment::report::fewer_frames;
 use crate::scenario::fingerprint::files_of;
 use crate::scenario::weights_choice::weights_of;
 
@@ -84,20 +82,9 @@ impl OpenedData {
     /// An error when it cannot be read, the protocol contradicts itself, or no scenario has an ego of it.
     pub fn open(trial: &Trial) -> Result<Self> {
         let options = OpenOptions::with_intensity_scale(trial.intensity_scale);
-        let dataset = dataset::open_with(&trial.dataset, &options)?;
-        let protocol = trial.protocol.resolve(dataset.layout);
-        let protocol = protocol.map_err(|error| anyhow!("evaluation protocol: {error}"))?;
-        let all = dataset.scenarios.iter();
-        let arranged = all.filter_map(|scenario| protocol.arrange(scenario));
-        let mut scenarios: Vec<Scenario> = arranged.collect();
-        if scenarios.is_empty() && !dataset.scenarios.is_empty() {
-            let (path, kind) = (trial.dataset.display(), protocol.ego);
-            bail!("{path}: no scenario in it has an ego of the protocol: ego_kind is {kind:?}");
-        }
-        let frames = trial.setup.frames.unwrap_or(usize::MAX);
-        for scenario in &mut scenarios {
-            scenario.ticks.truncate(frames);
-        }
+        let (path, frames) = (&trial.dataset, trial.setup.frames);
+        let dataset = dataset::open_with(path, &options)?;
+        let (protocol, scenarios) = trial.protocol.arrange_all(path, &dataset, frames)?;
         Ok(Self {
             scenarios,
             recorded: dataset.scenarios,
@@ -114,17 +101,9 @@ impl OpenedData {
         evenly_spread(&all, scenarios.unwrap_or(usize::MAX)).into_iter()
     }
 
-    /// Sentences about what there is less of than was asked for: scenarios with an ego of the protocol, frames.
+    /// Sentences about what there is less of than was asked for, see [`lacking`].
     pub fn lacking(&self, scenarios: Option<usize>, frames: Option<usize>) -> Vec<String> {
-        let kept: HashSet<&str> = self.scenarios.iter().map(|one| one.name.as_str()).collect();
-        let all = self.recorded.iter().map(|one| one.name.as_str());
-        let others: Vec<&str> = all.filter(|name| !kept.contains(name)).collect();
-        let others = (!others.is_empty()).then(|| others.join(", "));
-        let others =
-            others.map(|names| format!("left out, without an ego of the protocol: {names}"));
-        let longest = self.chosen(scenarios).map(|one| one.ticks.len()).max();
-        let fewer = fewer_frames(longest.unwrap_or(0), frames);
-        others.into_iter().chain(fewer).collect()
+        lacking(&self.recorded, &self.scenarios, scenarios, frames)
     }
 
     /// Number of frames of so many scenarios.
@@ -168,7 +147,7 @@ impl Trial {
         Ok(CellKey {
             method,
             // The debug text has every field, so a new setting changes the key by itself.
-            sha256: provenance.key(&format!("{method} {settings:?}")),
+            sha256: provenance.key(&format!("{method} {settings:?} {:?}", data.protocol)),
             provenance,
         })
     }
@@ -199,6 +178,8 @@ impl Trial {
         let encodes = *codec != CodecConfig::default() || *rate != RateConfig::default();
         let rule = if encodes && !maps {
             "options of the codec and of the rate are for feature maps: METHODS sends none"
+        } else if encodes && setup.agents.boxes == Some(SentBoxes::Only) {
+            "options of the codec and of the rate are for feature maps: with boxes only METHODS sends none"
         } else if setup.agents.boxes.is_some() && !maps {
             "boxes is for methods that exchange feature maps: METHODS does not"
         } else if setup.agents.weights.is_some() && !messages {
@@ -359,9 +340,7 @@ fn judged(
     evaluator.left_out.add_findings(findings);
     let detector = evaluator.ego.detector().config();
     let map_values = detector.feature_grid().cells() as u64 * detector.sent_channels() as u64;
-    // Without a compute time, a result is as old as its sweep by definition, which is no latency.
-    let Setup { link, compute, .. } = &trial.setup;
-    let is_timed = link.is_some() && *compute != ComputeTimes::default();
+    let is_timed = evaluator.setup.is_timed();
     let mut scores: Option<FrameScores> = None;
     let out = trial.out.as_ref();
     let files = out.map(|out| frame_files::create(out, method));
@@ -375,10 +354,6 @@ fn judged(
             scores.get_or_insert_with(|| FrameScores::new(ego.clone(), evaluator.rule, map_values));
         scores.change_ego(ego);
         let judged = evaluator.run(scenario, &mut |frame| {
-            // It is counted as left out.
-            if frame.frames[0].world_from_lidar.is_none() {
-                return ControlFlow::Continue(());
-            }
             let mut files = files.iter_mut();
             let written = files.try_for_each(|files| files.add(Some(&scenario.name), &frame));
             judge(scores, frame, is_timed);
@@ -390,7 +365,7 @@ fn judged(
             break;
         }
     }
-    let scores = scores.filter(|scores| !scores.records().is_empty());
+    let scores = scores.filter(|scores| scores.ticks() != (0, 0));
     let scores = scores.with_context(|| {
         let (path, reasons) = (trial.dataset.display(), evaluator.left_out.reasons());
         format!("{path}: there is no frame in it that can be evaluated{reasons}")
@@ -456,6 +431,8 @@ mod tests {
         assert!(data.lacking(None, None).is_empty());
         let fewer = "9 frames were asked for, there were 1";
         assert_eq!(data.lacking(Some(1), Some(9)), [fewer]);
+        let fewer = "4 scenarios were asked for, there were 3";
+        assert_eq!(data.lacking(Some(4), Some(1)), [fewer]);
     }
 
     #[test]

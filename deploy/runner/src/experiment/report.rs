@@ -55,14 +55,6 @@ pub fn print_unlocated(metrics: &Metrics, pose: &PoseSourceConfig, scene: &Path)
     }
 }
 
-/// Sentence about the number of frames of a scenario where it is below the one that was asked for.
-pub fn fewer_frames(frames: usize, asked: Option<usize>) -> Option<String> {
-    let asked = asked.filter(|asked| *asked > frames)?;
-    Some(format!(
-        "{asked} frames were asked for, there were {frames}"
-    ))
-}
-
 /// Lines about one run below its row of the table.
 pub fn run_notes(result: &RunResult) -> String {
     let messages = &result.metrics.messages;
@@ -127,7 +119,7 @@ fn columns(all: &[Metrics]) -> Vec<MetricColumn> {
     use Side::{Left, Right};
     // Streaming AP exists only where results have a time of publication.
     let is_live = all.iter().any(|metrics| metrics.ap_streaming.is_some());
-    let has_network = all.iter().any(|metrics| metrics.contribution.sent > 0);
+    let has_network = all.iter().any(|of| of.contribution.sent > Some(0));
     let name = if is_live { "answered" } else { "frames" };
     let by_frame = all.iter().any(|of| of.ap_order() == ApOrder::Frame);
     let columns: [MetricColumn; 14] = [
@@ -204,23 +196,17 @@ fn comparison(all: &[Metrics]) -> String {
     }
     for metrics in all {
         let (method, Contribution { sent, used, .. }) = (&metrics.method, metrics.contribution);
-        if let Some(what) = shared(method).filter(|_| used < sent) {
+        let exchange = method.parse().map(Method::exchange);
+        let fuses = exchange.is_ok_and(|exchange| exchange != Exchange::Nothing);
+        if let (true, Some(sent), Some(used)) = (fuses && used < sent, sent, used) {
             let mean = metrics.contribution.sent_bytes_mean;
-            let size = mean.map_or(String::new(), |mean| format!(" of {} each", bytes(mean)));
-            let _ = writeln!(text, "{method}: of {sent} {what}{size} {used} were fused");
+            // Lists of boxes may go beside feature maps, so no size is that of each message.
+            let size = mean.map(|mean| format!(" ({} a neighbour and frame)", bytes(mean)));
+            let size = size.unwrap_or_default();
+            let _ = writeln!(text, "{method}: of {sent} messages{size} {used} were fused");
         }
     }
     text
-}
-
-/// Data of the neighbours that a method fuses; `None` if it fuses none.
-fn shared(method: &str) -> Option<&'static str> {
-    match method.parse().map(Method::exchange) {
-        Ok(Exchange::Features) => Some("feature maps"),
-        Ok(Exchange::Boxes) => Some("lists of boxes"),
-        Ok(Exchange::Points) => Some("clouds"),
-        Ok(Exchange::Nothing) | Err(_) => None,
-    }
 }
 
 fn frames(metrics: &Metrics) -> String {
@@ -351,8 +337,8 @@ mod tests {
     fn undelivered_messages_are_reported() {
         let contribution = Contribution {
             fused_per_frame: Some(0.05),
-            sent: 38,
-            used: 2,
+            sent: Some(38),
+            used: Some(2),
             sent_bytes_mean: Some(3_150_000.0),
         };
         let latency_ms = Latencies::default();
@@ -374,7 +360,7 @@ mod tests {
             "{text}"
         );
         assert!(
-            text.contains("max: of 38 feature maps of 3.1 MB each 2 were fused"),
+            text.contains("max: of 38 messages (3.1 MB a neighbour and frame) 2 were fused"),
             "{text}"
         );
         assert!(!text.contains(" / "), "no latency is known: {text}");

@@ -49,7 +49,7 @@ pub struct Experiment {
     /// Number format in which networks are computed.
     #[serde(default)]
     pub precision: InferencePrecision,
-    /// Number format of transmitted feature values, unless the grid has encodings.
+    /// Number format of transmitted feature values, unless the grid has encodings. The default of a scenario is `f32`.
     #[serde(default = "half")]
     pub dtype: Dtype,
     /// Pose source, unless the grid has pose noise, or a row or column of a table its own.
@@ -106,13 +106,13 @@ pub struct Grid {
     /// Further methods, for comparison: with the first encoding only.
     #[serde(default)]
     pub reference: Vec<Method>,
-    /// Mean delay after the last bit was sent, milliseconds.
+    /// Mean delay after the last bit was sent, milliseconds; with jitter before negative delays become 0.
     pub latency_ms: Option<Vec<f64>>,
-    /// Standard deviation of that delay, milliseconds; no delay is below 0.
+    /// Standard deviation of that normally distributed delay, milliseconds; negative delays become 0.
     pub jitter_ms: Option<Vec<f64>>,
     /// Rate of each link, Mbit/s; `.inf`: unlimited.
     pub bandwidth_mbps: Option<Vec<f64>>,
-    /// Fraction of the messages that are lost.
+    /// Fraction of the messages that are lost, whatever the link's `loss_unit`.
     pub loss: Option<Vec<f64>>,
     /// Errors of the poses.
     pub pose_noise: Option<Vec<NoiseSpec>>,

@@ -32,6 +32,8 @@ pub fn without_effect(scenario: &Scenario) -> Vec<String> {
 mod tests {
     use super::*;
 
+    use agent::config::SentBoxes;
+
     #[test]
     fn settings_without_effect_are_named_of_single_vehicles_too() {
         let folder = tempfile::tempdir().unwrap();
@@ -41,6 +43,11 @@ mod tests {
         std::fs::write(&file, text).unwrap();
         let mut scenario = Scenario::read(&file).unwrap();
         assert!(without_effect(&scenario).is_empty());
+        let mut of_boxes = scenario.clone();
+        of_boxes.agents.boxes = Some(SentBoxes::Only);
+        of_boxes.agents.rate.message_bytes = Some(75_000);
+        let found = without_effect(&of_boxes);
+        assert!(found[0].contains("with boxes only"), "{found:?}");
         scenario.method = "late".parse().unwrap();
         let found = without_effect(&scenario);
         let expected = "without effect: vehicles.1009: options of the codec and of the rate are";

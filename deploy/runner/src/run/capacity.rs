@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use agent::config::{AgentSettings, SentBoxes};
 use bus::process_cpu_s;
-use dataset::LoadOptions;
+use dataset::{LoadOptions, period_nanos};
 use deploy::report::{Capacity, Machine};
 use ego_fuser_offline::evaluation::{EvaluateError, Evaluator};
 use fusion::{Exchange, Method};
@@ -143,12 +143,8 @@ fn period_ms(fleet: &Fleet) -> Option<f64> {
     let scene = &scenario.scene;
     let has_pace =
         !scene.lockstep && scene.rate > 0.0 && scenario.models.device == ComputeDevice::Cpu;
-    let times = recorded.ticks.iter().map(|tick| tick.capture_nanos);
-    let pairs = times.clone().zip(times.skip(1));
-    let steps = pairs.map(|(from, to)| to.saturating_sub(from));
-    // The shortest step is the hardest to keep up with.
-    let shortest_nanos = steps.min().filter(|_| has_pace)?;
-    Some(shortest_nanos as f64 * 1e-6 / scene.rate)
+    let period_nanos = period_nanos(&recorded.ticks).filter(|_| has_pace)?;
+    Some(period_nanos as f64 * 1e-6 / scene.rate)
 }
 
 /// Megabytes of a frame: of each vehicle its sweep, and its map if it sends maps.
@@ -234,7 +230,8 @@ pub fn remedies(fleet: &Fleet, capacity: Option<&Capacity>) -> String {
         (fleet.pose_source() == "pgc").then_some("tracked poses (agents.pose.tracked)"),
         (sends_maps && scenario.method != Method::MAX).then_some("method max"),
         (fleet.agents.len() > 2).then_some("fewer vehicles (scene.agents)"),
-        Some(rate.as_str()),
+        // A link has the pace of the scene only.
+        scenario.link.is_none().then_some(rate.as_str()),
         fits.then_some("clock: stepped"),
         (!fits).then_some("scene.lockstep: true"),
     ];

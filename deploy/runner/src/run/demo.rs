@@ -14,8 +14,8 @@ use crate::run::picture::{CavView, Picture};
 const MARGIN_M: f64 = 12.0;
 
 /// Draws that frame of a run. A picture that cannot be drawn is a warning: the run itself is complete.
-pub fn draw(fleet: &Fleet, board: &FrameScores, path: &Path) -> Option<PathBuf> {
-    match try_draw(fleet, board.showpiece()?, path) {
+pub fn draw(fleet: &Fleet, scores: &FrameScores, path: &Path) -> Option<PathBuf> {
+    match try_draw(fleet, scores.showpiece()?, path) {
         Ok(()) => Some(path.to_path_buf()),
         Err(error) => {
             tracing::warn!("no picture of the run: {error}");

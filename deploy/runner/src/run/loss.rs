@@ -29,7 +29,7 @@ fn reasons(result: &RunResult) -> Vec<String> {
     let lost = dropped.filter(|(reason, count)| reason.is_loss() && **count > 0);
     let lost = lost.map(|(reason, count)| format!("{count} {}", reason.as_str().replace('_', " ")));
     let lost: Vec<String> = lost.collect();
-    let has_begun = !result.interrupted || metrics.ticks > 0;
+    let has_begun = !result.interrupted || metrics.ticks + metrics.left_out.ticks > 0;
     let (accounts, files) = (result.balance.discrepancies.len(), result.unwritten.len());
     let counted = [
         (!has_begun).then(|| "ended before its first tick".into()),

@@ -22,7 +22,7 @@ use deploy::score::metrics::Metrics;
 use deploy::score::{
     FrameScores, ProcessStats, Progress, Scored, ScorerNode, TRACKS, offline_intervals,
 };
-use ego_fuser_offline::evaluation::without_true_pose;
+use ego_fuser_offline::evaluation::add_unplaced_tick;
 use protocol::{Ledger, ProcessId, ProcessUsage, Role, RunId};
 use support::provenance::Provenance;
 use support::{atomic_file, output};
@@ -97,7 +97,7 @@ fn go(fleet: &Fleet, options: &RunOptions, run: &RunId, folder: &RunFolder) -> R
         programs: &options.programs,
         folder,
     };
-    let (events, happened) = channel();
+    let (events, process_events) = channel();
     let network = &fleet.scenario.network;
     let restarts = fleet.scenario.timeouts.restarts;
     let router = Router::start(network, &mut context, restarts, &events, &stop)?;
@@ -105,7 +105,7 @@ fn go(fleet: &Fleet, options: &RunOptions, run: &RunId, folder: &RunFolder) -> R
     check_free(&router.place, &fleet.scenario.network, run, &specs)?;
     let scorer = start_scorer(fleet, &context, &router, &specs)?;
     // Not returned at once on an error: scorer and router have to be ended first.
-    let events = (&events, &happened);
+    let events = (&events, &process_events);
     let watched = watch(fleet, &context, specs, &router, events, &scorer, &stop);
     let mut scored = scorer.finish();
     let mut refused = Vec::new();
@@ -144,11 +144,11 @@ fn start_scorer(
 ) -> Result<ScorerNode> {
     let (ego, agents) = (&fleet.ego, &fleet.agents);
     let rule = fleet.applied_protocol().ground_truth;
-    let board = FrameScores::new(ego.clone(), rule, fleet.map_values());
+    let scores = FrameScores::new(ego.clone(), rule, fleet.map_values());
     let [detections, truth, tracks] = LINES.map(|name| context.folder.file(name));
     let tracks = fleet.scenario.ego.tracks.then_some(tracks);
     let (session, lines) = (router.place.session.clone(), [detections, truth]);
-    let mut scorer = ScorerNode::start(session, context.run, agents, ego, board, lines, tracks)?;
+    let mut scorer = ScorerNode::start(session, context.run, agents, ego, scores, lines, tracks)?;
     if let Some(address) = fleet.scenario.network.metrics {
         let peers = specs.iter().filter_map(|spec| {
             Some(MetricsPeer {
@@ -191,7 +191,7 @@ struct Watched {
 }
 
 /// Arrival time of each sweep at the ego's agent, by capture time. An agent on another host writes none.
-fn swept(log: &Path) -> BTreeMap<u64, u64> {
+fn sweep_arrivals(log: &Path) -> BTreeMap<u64, u64> {
     support::sweep_log::read(log).unwrap_or_else(|error| {
         if error.kind() != std::io::ErrorKind::NotFound {
             let log = log.display();
@@ -207,7 +207,7 @@ fn watch(
     context: &SessionContext<'_>,
     specs: Vec<ProcessSpec>,
     router: &Router,
-    (events, happened): (&Sender<ProcessEvent>, &Receiver<ProcessEvent>),
+    (events, process_events): (&Sender<ProcessEvent>, &Receiver<ProcessEvent>),
     scorer: &ScorerNode,
     stop: &Stop,
 ) -> Result<Watched> {
@@ -238,7 +238,7 @@ fn watch(
     );
     let mut supervisor = Supervisor::start(specs, &folder.log_dir(), restarts, events)?;
     let processes = (&supervisor, router.supervisor());
-    let ending = watch.follow(processes, happened, scorer, stop, &mut display);
+    let ending = watch.follow(processes, process_events, scorer, stop, &mut display);
     let mut offline = scorer.absent();
     watch.end();
     watch.write_status(Phase::Ending, &scorer.progress());
@@ -252,7 +252,7 @@ fn watch(
     killed.extend(supervisor.end(|_| true, all_until + RECORDER_SHARE));
     display.finish();
     // Events that came while the processes were ended, which nobody has read.
-    while let Ok(event) = happened.try_recv() {
+    while let Ok(event) = process_events.try_recv() {
         watch.note(&event);
     }
     // Messages of any process may have been lost in that time.
@@ -326,10 +326,10 @@ fn write(
     (run, folder): (&RunId, RunFolder),
     (scored, refused): (Scored, Vec<RefusalCount>),
     watched: &Watched,
-    fingerprint: JoinHandle<std::io::Result<Provenance>>,
+    fingerprint: JoinHandle<Option<Provenance>>,
     capacity: Option<Capacity>,
 ) -> RunResult {
-    let board = &scored.scores;
+    let scores = &scored.scores;
     let mut unwritten = sync_lines(&folder, scored.unwritten);
     let mut sum = Ledger::default();
     let ledgers = scored.stats.iter().map(|process| &process.ledger);
@@ -337,23 +337,19 @@ fn write(
     // Before the balance, which accounts of offline processes cannot meet.
     let exempted = sum.exempt(|account| offline_intervals::concerns(&watched.offline, account));
     let balance = sum.balance();
-    let missed = missed(fleet, board, &watched.ending);
-    let collected = fingerprint.join().ok();
-    let provenance = collected.and_then(|collected| {
-        collected
-            .inspect_err(|error| tracing::warn!("no hashes of what the run read: {error}"))
-            .ok()
-    });
-    let mut metrics = metrics(fleet, board, &scored.progress, &sum);
-    metrics.left_out.add_findings(fleet.findings.clone());
+    let missed = missed(fleet, scores, &watched.ending);
+    let provenance = fingerprint.join().ok().flatten();
+    let mut metrics = metrics(fleet, scores, &scored.progress, &sum);
+    metrics.left_out.merge(&fleet.left_out);
     metrics.ticks = metrics.answered + missed;
     metrics.provenance = provenance.clone().map(Provenance::with_command);
     let mut written = vec![folder.write_json(deploy::score::metrics::FILE, &metrics)];
     let remedies = remedies(fleet, capacity.as_ref());
-    let mut run_report = RunReport::new(run, &metrics, board.records(), &scored.stats, capacity);
+    let mut run_report = RunReport::new(run, &metrics, scores.records(), &scored.stats, capacity);
     run_report.causes.clone_from(&watched.causes);
     written.push(folder.write_json(report::FILE, &run_report));
-    let frames = frames_csv(board.records(), &swept(&folder.file(SWEEP_LOG)), None);
+    let arrivals = sweep_arrivals(&folder.file(SWEEP_LOG));
+    let frames = frames_csv(scores.records(), &arrivals, None);
     written.push(folder.write("frames.csv", &frames));
     let report = LedgerReport {
         balances: balance.is_exact(),
@@ -375,7 +371,7 @@ fn write(
     written.push(folder.write("scenario.yaml", &resolved.to_yaml()));
     let errors = written.into_iter().filter_map(|written| written.err());
     unwritten.extend(errors.map(|error| error.to_string()));
-    let picture = crate::run::demo::draw(fleet, board, &folder.file("frame.png"));
+    let picture = crate::run::demo::draw(fleet, scores, &folder.file("frame.png"));
     let interrupted = matches!(watched.ending, Ending::Asked);
     RunResult {
         folder,
@@ -392,27 +388,26 @@ fn write(
     }
 }
 
-/// Ticks without a result. Those that no process reported, as the replay crashed with them in transit, are known by
-/// their number only, once the scene is over.
-fn missed(fleet: &Fleet, board: &FrameScores, ending: &Ending) -> u64 {
-    let (reported, _) = board.ticks();
+/// Ticks without a result, of those that count. Those that no process reported, as the replay crashed with them in transit,
+/// are known by their number only, once the scene is over.
+fn missed(fleet: &Fleet, scores: &FrameScores, ending: &Ending) -> u64 {
+    let reported = scores.ticks().0 + scores.unplaced().len() as u64;
     // After an early end it is unknown how many ticks were due.
     let played = fleet.ticks.filter(|_| matches!(ending, Ending::Over));
-    board.missed() + (played.unwrap_or(0) as u64).saturating_sub(reported)
+    scores.missed() + (played.unwrap_or(0) as u64).saturating_sub(reported)
 }
 
-fn metrics(fleet: &Fleet, board: &FrameScores, progress: &Progress, sum: &Ledger) -> Metrics {
-    let span = progress.span;
-    let span = span.map(|(first, last)| last.duration_since(first));
-    let seconds = span.map_or(0.0, |span| span.as_secs_f64());
+fn metrics(fleet: &Fleet, scores: &FrameScores, progress: &Progress, sum: &Ledger) -> Metrics {
+    let span = { progress.span }.map(|(first, last)| (last - first).as_secs_f64());
     let names = [fleet.scenario.method.name(), fleet.pose_source()];
     let mut metrics = Metrics {
         protocol: Some(fleet.applied_protocol()),
-        ..Metrics::of(board, "wall", names, seconds, sum, None)
+        ..Metrics::of(scores, "wall", names, span.unwrap_or(0.0), sum, None)
     };
-    for &tick in board.unplaced() {
-        let problem = without_true_pose(&fleet.recorded, tick as usize, &fleet.ego);
-        metrics.left_out.add_unreadable(0, problem);
+    let variant = fleet.scenario.scene.variant.as_deref();
+    for &tick in scores.unplaced() {
+        let at = (tick as usize, &fleet.ego);
+        add_unplaced_tick(&mut metrics.left_out, &fleet.recorded, at, variant);
     }
     metrics
 }

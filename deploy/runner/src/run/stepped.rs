@@ -41,7 +41,7 @@ pub fn run_scenario(scenario: &Scenario, options: &RunOptions) -> Result<RunResu
     };
     // Written into scenario.yaml with the rest, so that the run can be repeated with these times.
     stepped.compute = Some(compute);
-    evaluator.set_compute(compute);
+    evaluator.setup.compute = compute;
     let in_processes = stepped.processes;
     in_folder(&fleet, options, |run, folder| {
         let mut running = None;
@@ -51,10 +51,10 @@ pub fn run_scenario(scenario: &Scenario, options: &RunOptions) -> Result<RunResu
             evaluator.set_processes(Some(remote));
             running = Some(processes);
         }
-        let board = play(&fleet, &mut evaluator, folder)?;
+        let scores = play(&fleet, &mut evaluator, folder)?;
         evaluator.set_processes(None);
         let killed = running.map(AgentProcesses::end).unwrap_or_default();
-        let result = write(&fleet, &evaluator, &board, (run, folder.clone()), options)?;
+        let result = write(&fleet, &evaluator, &scores, (run, folder.clone()), options)?;
         Ok(RunResult { killed, ..result })
     })
 }
@@ -62,44 +62,42 @@ pub fn run_scenario(scenario: &Scenario, options: &RunOptions) -> Result<RunResu
 /// Computes all ticks; detections are appended to their file.
 fn play(fleet: &Fleet, evaluator: &mut Evaluator, folder: &RunFolder) -> Result<FrameScores> {
     let (rule, map_values) = (fleet.applied_protocol().ground_truth, fleet.map_values());
-    let mut board = FrameScores::new(fleet.ego.clone(), rule, map_values);
+    let mut scores = FrameScores::new(fleet.ego.clone(), rule, map_values);
     let lines = FrameLines::create(folder.path()).at(folder.path());
     let mut lines = lines.map_err(RunFolderError::Write)?;
+    let is_timed = evaluator.setup.is_timed();
     let bar = progress::bar(fleet.ticks.unwrap_or(0), "ticks");
     let _ = evaluator.run(&fleet.recorded, &mut |frame: EvaluatedFrame| {
         bar.inc(1);
         let written = lines.add(None, &frame);
-        judge(&mut board, frame, true);
+        judge(&mut scores, frame, is_timed);
         written
     })?;
     bar.finish_and_clear();
     let finished = lines.finish().at(folder.path());
     finished.map_err(RunFolderError::Write)?;
-    Ok(board)
+    Ok(scores)
 }
 
 fn write(
     fleet: &Fleet,
     evaluator: &Evaluator,
-    board: &FrameScores,
+    scores: &FrameScores,
     (run, folder): (&RunId, RunFolder),
     options: &RunOptions,
 ) -> Result<RunResult> {
     let ledger = &evaluator.ledger;
     let balance = ledger.balance();
-    let (poses, seconds) = (fleet.pose_source(), board.seconds());
-    let mut metrics = metrics(board, evaluator, "stepped", poses, seconds);
-    metrics.left_out.add_findings(fleet.findings.clone());
-    let provenance = fleet
-        .provenance(&options.programs)
-        .inspect_err(|error| tracing::warn!("no hashes of what the run read: {error}"));
-    let provenance = provenance.ok();
+    let (poses, seconds) = (fleet.pose_source(), scores.seconds());
+    let mut metrics = metrics(scores, evaluator, "stepped", poses, seconds);
+    metrics.left_out.merge(&fleet.left_out);
+    let provenance = fleet.provenance(&options.programs);
     metrics.provenance = provenance.clone().map(Provenance::with_command);
     folder.write_json(deploy::score::metrics::FILE, &metrics)?;
     // Times of processes on the wall clock say nothing here, so none are reported.
-    let report = RunReport::new(run, &metrics, board.records(), &[], None);
+    let report = RunReport::new(run, &metrics, scores.records(), &[], None);
     folder.write_json(report::FILE, &report)?;
-    let frames = frames_csv(board.records(), &BTreeMap::new(), None);
+    let frames = frames_csv(scores.records(), &BTreeMap::new(), None);
     folder.write("frames.csv", &frames)?;
     let accounts = LedgerReport {
         balances: balance.is_exact(),
@@ -114,12 +112,12 @@ fn write(
         ..fleet.scenario.clone()
     };
     folder.write("scenario.yaml", &resolved.to_yaml())?;
-    let picture = crate::run::demo::draw(fleet, board, &folder.file("frame.png"));
+    let picture = crate::run::demo::draw(fleet, scores, &folder.file("frame.png"));
     Ok(RunResult {
         folder,
         metrics,
         balance,
-        missed: board.missed(),
+        missed: scores.missed(),
         interrupted: false,
         killed: Vec::new(),
         unwritten: Vec::new(),

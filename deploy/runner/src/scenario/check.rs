@@ -32,6 +32,9 @@ impl Scenario {
         let is_looped = self.scene.repeat && self.poses().into_iter().any(is_cached);
         let rule = "must be false with agents.pose cached: its table has the times of one lap only";
         require(!is_looped, "scene.loop", true, rule)?;
+        let is_paced = self.link.is_none() || self.scene.rate == 1.0;
+        let rule = "must be 1 with link, whose delays and rates are those of the scene";
+        require(is_paced, "scene.rate", self.scene.rate, rule)?;
         match &self.ego.id {
             Some(ego) if !self.scene.agents.is_empty() && !self.scene.agents.contains(ego) => Err(
                 FieldError::new("ego.id", ego, "must be one of scene.agents"),
@@ -56,9 +59,11 @@ impl Scenario {
         scene.validate()?;
         self.ego.validate()?;
         let needed = self.method.exchange().stream();
+        let in_processes =
+            self.clock == Clock::Wall || self.stepped.is_some_and(|stepped| stepped.processes);
         self.settings().try_for_each(|settings| {
             settings.validate()?;
-            settings.check_attack(&settings.sent_for(needed))
+            settings.check_attack(&settings.sent_for(needed), in_processes)
         })?;
         self.record.iter().try_for_each(|record| record.validate())
     }
@@ -127,6 +132,8 @@ impl Scenario {
         let (scene, remote) = (&self.scene, self.remote_agents.first());
         let (pace, metrics) = (self.ego.pace != PaceMode::Auto, self.network.metrics);
         let is_secured = self.security.is_some();
+        let watched = self.settings().any(|settings| settings.rate.watch_queue);
+        let watched = watched.then(|| "true".into());
         let off = "must be false with clock stepped";
         let own = "runs in simulation time have a router of their own when there is security";
         let connect = self.network.connect.clone();
@@ -139,6 +146,7 @@ impl Scenario {
                 "must be 1 with clock stepped, which has no pace",
             ),
             ("scene.loop", scene.repeat.then(|| "true".into()), off),
+            ("agents.rate.watch_queue", watched, off),
             ("scene.lockstep", scene.lockstep.then(|| "true".into()), off),
             ("ego.pace", pace.then(|| "every_sweep".into()), auto),
             (

@@ -370,6 +370,14 @@ mod tests {
                 "scene.rate is 2",
             ),
             (
+                "scene: {dir: ., rate: 0.5}\nlink: {model: ideal}",
+                "scene.rate is 0.5: must be 1 with link",
+            ),
+            (
+                "scene: {dir: .}\nclock: stepped\nagents: {rate: {watch_queue: true}}",
+                "agents.rate.watch_queue is true: must be false with clock stepped",
+            ),
+            (
                 "scene: {dir: ., lockstep: true}\nclock: stepped",
                 "scene.lockstep is true",
             ),
@@ -381,6 +389,14 @@ mod tests {
             (
                 "scene: {dir: .}\nvehicles: {a: {falsification: false_velocity}}",
                 "agents.falsification is false_velocity: needs boxes",
+            ),
+            (
+                "scene: {dir: .}\nvehicles: {a: {falsification: copied}}",
+                "agents.falsification is copied: must be another",
+            ),
+            (
+                "scene: {dir: .}\nclock: stepped\nstepped: {processes: true}\nagents: {falsification: copied}",
+                "agents.falsification is copied: must be another",
             ),
             (
                 "scene: {dir: .}\nclock: stepped\nstepped: {compute: {pose_ms: -1, map_ms: 0, fuse_ms: 0}}",
@@ -419,6 +435,9 @@ mod tests {
                 "{line}: {message}"
             );
         }
+        let copied = "scene: {dir: .}\nmodels: {weights: s.yaml}\nclock: stepped\nagents: {falsification: copied}";
+        std::fs::write(&file, copied).unwrap();
+        Scenario::load(&file).unwrap();
     }
 
     #[test]

@@ -232,8 +232,23 @@ fn the_three_precisions_differ_in_what_they_count() {
 }
 
 #[test]
-fn a_result_without_the_true_pose_of_the_ego_counts_in_no_precision() {
-    let [known, with_unknown] = [2, 4].map(|ticks| {
+fn the_first_tick_of_another_round_is_not_compared_with_the_boxes_of_the_last() {
+    let mut scores = scores();
+    // Another round begins more than a minute later on the scene's clock, and goes on at once.
+    for (place, tick) in [(0, 0), (1, 1), (2, 700), (3, 701)] {
+        let began_ms = began_ms(place);
+        scores.truth(&stamp("replay", tick, began_ms), truth(tick));
+        scores.result(&stamp("e", tick, began_ms + 50), result(tick, &[10.0]));
+    }
+    scores.close();
+    let records = scores.records().iter();
+    let streamed: Vec<bool> = records.map(|record| record.streamed.is_some()).collect();
+    assert_eq!(streamed, [false, true, false, true]);
+}
+
+#[test]
+fn a_tick_without_the_true_pose_of_the_ego_counts_in_no_score_and_its_result_has_a_record() {
+    let [known, with_unknown] = [2, 5].map(|ticks| {
         let mut scores = scores();
         for tick in 0..ticks {
             let mut truth = truth(tick);
@@ -243,12 +258,20 @@ fn a_result_without_the_true_pose_of_the_ego_counts_in_no_precision() {
                 .drain(..(tick as usize).saturating_sub(1).min(2));
             let began_ms = began_ms(tick);
             scores.truth(&stamp("replay", tick, began_ms), truth);
-            let result = result(tick, &[10.0, 20.0]);
-            scores.result(&stamp("e", tick, began_ms + 50), result);
+            // At tick 4 the ego takes no part.
+            if tick < 4 {
+                let result = result(tick, &[10.0, 20.0]);
+                scores.result(&stamp("e", tick, began_ms + 50), result);
+            }
         }
         scores.close();
         scores
     });
+    assert_eq!([&known, &with_unknown].map(FrameScores::ticks), [(2, 2); 2]);
+    assert_eq!(
+        (with_unknown.missed(), with_unknown.records().len()),
+        (0, 4)
+    );
     assert_eq!(known.average_precision(), with_unknown.average_precision());
     let [before, after] = [&known, &with_unknown].map(|scores| scores.live.unanswered_empty());
     assert_eq!(before, after);
@@ -256,10 +279,27 @@ fn a_result_without_the_true_pose_of_the_ego_counts_in_no_precision() {
     assert_eq!(before, after);
     assert_eq!(
         (known.unplaced(), with_unknown.unplaced()),
-        (&[][..], &[2, 3][..])
+        (&[][..], &[2, 3, 4][..])
     );
     let last = &with_unknown.records()[3];
     assert_eq!((last.latency_ms, last.detected), (Some(50.0), 0));
+    assert_eq!(with_unknown.showpiece().map(|frame| frame.tick), Some(0));
+}
+
+#[test]
+fn where_nobody_has_a_true_pose_results_have_a_record_and_no_score() {
+    let mut scores = scores();
+    for tick in 0..2 {
+        let agents = Vec::new();
+        scores.truth(&stamp("replay", tick, 0), Truth { tick, agents });
+        scores.result(&stamp("e", tick, 50), result(tick, &[10.0]));
+    }
+    scores.close();
+    assert_eq!((scores.ticks(), scores.missed()), ((0, 0), 0));
+    assert_eq!(
+        (scores.records().len(), scores.unplaced()),
+        (2, &[0, 1][..])
+    );
 }
 
 #[test]

@@ -10,10 +10,10 @@ use serde::{Deserialize, Serialize};
 pub struct Contribution {
     /// Neighbours whose data are in the result, mean over the frames.
     pub fused_per_frame: Option<f64>,
-    /// Number of feature maps, boxes or clouds that neighbours have sent; 0 without a network.
-    pub sent: u64,
-    /// Number of those that arrived in time and were used.
-    pub used: u64,
+    /// Number of feature maps, boxes or clouds that neighbours have sent; `null` without a network, as nothing is sent.
+    pub sent: Option<u64>,
+    /// Number of those that arrived in time and were used; `null` as above.
+    pub used: Option<u64>,
     /// Mean bytes of all messages that a neighbour sent for a frame, headers and pose message included, used or not.
     pub sent_bytes_mean: Option<f64>,
 }
@@ -44,10 +44,11 @@ impl Contribution {
             }
         }
         let sent_frames: u64 = sent_frames.values().sum();
+        let has_network = ledger.iter().next().is_some();
         Self {
             fused_per_frame: (frames > 0).then(|| fused as f64 / frames as f64),
-            sent,
-            used,
+            sent: has_network.then_some(sent),
+            used: has_network.then_some(used),
             sent_bytes_mean: sent_bytes
                 .filter(|_| sent > 0)
                 .map(|bytes| bytes as f64 / sent_frames as f64),
@@ -97,7 +98,7 @@ mod tests {
     fn maps_of_neighbours_are_counted_and_neither_poses_nor_the_egos_own() {
         let (ledger, ego) = ledger();
         let contribution = Contribution::of(4, 2, Some(&ego), &ledger, Some(800));
-        assert_eq!((contribution.sent, contribution.used), (8, 2));
+        assert_eq!((contribution.sent, contribution.used), (Some(8), Some(2)));
         assert_eq!(
             (contribution.fused_per_frame, contribution.sent_bytes_mean),
             (Some(0.5), Some(100.0))
@@ -112,7 +113,8 @@ mod tests {
             let metrics = Metrics::of(&scores, "", ["max", "recorded"], 1.0, &ledger, bytes);
             (metrics.contribution.sent, metrics.contribution.used)
         };
-        assert_eq!((sent(Some(800)), sent(None)), ((12, 3), (8, 2)));
+        let in_run = (Some(8), Some(2));
+        assert_eq!((sent(Some(800)), sent(None)), ((Some(12), Some(3)), in_run));
     }
 
     #[test]
@@ -128,7 +130,7 @@ mod tests {
         let contribution = Contribution::of(4, 2, Some(&ego), &ledger, Some(800));
         assert_eq!(
             (contribution.sent, contribution.sent_bytes_mean),
-            (14, Some(100.0))
+            (Some(14), Some(100.0))
         );
     }
 
@@ -151,12 +153,14 @@ mod tests {
         ledger.sent(&Account::published(passed.clone()));
         ledger.received(&Account::towards(passed, &ProcessId::new("ego-1").unwrap()));
         let contribution = Contribution::of(4, 2, Some(&ego), &ledger, None);
-        assert_eq!((contribution.sent, contribution.used), (8, 3));
+        assert_eq!((contribution.sent, contribution.used), (Some(8), Some(3)));
     }
 
     #[test]
     fn without_frames_and_network_all_values_are_absent() {
         let nothing = Contribution::of(0, 0, None, &Ledger::default(), Some(0));
         assert_eq!(nothing, Contribution::default());
+        let fused = Contribution::of(4, 8, None, &Ledger::default(), Some(0));
+        assert_eq!((fused.fused_per_frame, fused.sent), (Some(2.0), None));
     }
 }

@@ -17,11 +17,15 @@ function keepLinks(frame) {
   kept = kept.filter((entry) => entry.capture_s > frame.capture_s - KEPT);
 }
 
-/// Time from one tick to the next, seconds.
+/// Time from one tick to the next, seconds: the median, which a pause in the recording does not change.
 function period(entries) {
-  const [first, last] = [entries[0], entries[entries.length - 1]];
-  const ticks = isKnown(first.tick) && isKnown(last.tick) ? last.tick - first.tick : entries.length - 1;
-  return ticks > 0 ? (last.capture_s - first.capture_s) / ticks : null;
+  const steps = entries.slice(1).map((entry, index) => {
+    const before = entries[index];
+    const ticks = isKnown(entry.tick) && isKnown(before.tick) ? entry.tick - before.tick : 1;
+    return ticks > 0 ? (entry.capture_s - before.capture_s) / ticks : 0;
+  }).filter((step) => step > 0).sort((a, b) => a - b);
+  const [low, high] = [steps[(steps.length - 1) >> 1], steps[steps.length >> 1]];
+  return steps.length ? (low + high) / 2 : null;
 }
 
 /// The three strips: name, unit, value of a link.

@@ -111,7 +111,4 @@ pub enum AlignError {
     /// The detector reported an error.
     #[error(transparent)]
     Detector(#[from] perception::detector::DetectorError),
-    /// A recording without true poses: its scenario, the stem of the frame's file, and the agent without a true pose.
-    #[error("{0} has no true pose to compare with")]
-    NoTruth(String),
 }

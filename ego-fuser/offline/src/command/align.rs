@@ -28,8 +28,8 @@ use support::cli::{BadInput, Outcome};
 
 /// Compares methods to align the ego and a neighbour: time per pair, transmitted bytes, success.
 ///
-/// Pairs are the ego (each scenario's first agent) and every neighbour within 70 m, at every tick. A pair that is not
-/// aligned counts as missed.
+/// Pairs are the ego and every neighbour within the communication range of the data set's protocol, at every tick. A pair
+/// that is not aligned counts as missed.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Arguments {
     #[command(flatten)]
@@ -56,10 +56,10 @@ pub(crate) struct Arguments {
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
     every: u32,
     /// Largest number of frames of each scenario [default: all].
-    #[arg(long, value_name = "N")]
-    frames: Option<usize>,
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+    frames: Option<u32>,
     /// Torch threads.
-    #[arg(long, default_value_t = 1)]
+    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=256))]
     threads: u16,
     /// Print JSON.
     #[arg(long)]
@@ -104,21 +104,21 @@ fn parse_source(text: &str) -> Result<(String, PathBuf), String> {
 impl Arguments {
     /// Compares, and prints the table.
     pub(crate) fn run(self) -> Result<Outcome> {
-        tch::set_num_threads(i32::from(self.threads.max(1)));
+        tch::set_num_threads(i32::from(self.threads));
         let mut left_out = LeftOut::default();
-        let scenarios = self.data.scenarios(&mut left_out)?;
+        let scenarios = self.data.arranged(&mut left_out)?;
         let mut rows = Vec::new();
         for (number, &boxes) in self.boxes.iter().enumerate() {
-            // Maps are read for every source of boxes; what they leave out is counted once.
-            let mut of_maps = LeftOut::default();
-            let mut methods = self.methods(&mut of_maps)?;
-            if number == 0 {
-                left_out.merge(&of_maps);
-            }
+            // Maps and frames are read for every source of boxes; what is left out of them is counted once.
+            let mut lost = LeftOut::default();
+            let mut methods = self.methods(&mut lost)?;
             // What exchanges no boxes is compared once.
             methods.retain(|method| number == 0 || method.needs_boxes);
             let mut source = self.box_source(boxes, &methods)?;
-            let found = self.compare(&methods, &mut source, &scenarios, &mut left_out)?;
+            let found = self.compare(&methods, &mut source, &scenarios, &mut lost)?;
+            if number == 0 {
+                left_out.merge(&lost);
+            }
             for (mut row, method) in found.into_iter().zip(&methods) {
                 if self.boxes.len() > 1 && method.needs_boxes {
                     row.method += match boxes {
@@ -133,7 +133,8 @@ impl Arguments {
             let maps = self.icp_map.iter().map(|folder| dataset::open(folder));
             let maps: Vec<Dataset> = maps.collect::<Result<_, _>>()?;
             let all = maps.into_iter().flat_map(|data| data.scenarios);
-            let all: Vec<Scenario> = scenarios.into_iter().chain(all).collect();
+            let scenarios = scenarios.into_iter().map(|(scenario, _)| scenario);
+            let all: Vec<Scenario> = scenarios.chain(all).collect();
             let sources = self.pose_source.iter().map(|(_, file)| file.clone());
             let files = self.weights.iter().cloned().chain(sources);
             output::line(rows_with_provenance(&rows, &all, files)?)?;
@@ -205,16 +206,17 @@ impl Arguments {
         &self,
         methods: &[AlignmentSpec],
         boxes: &mut BoxSource,
-        scenarios: &[Scenario],
+        scenarios: &[(Scenario, f64)],
         left_out: &mut LeftOut,
     ) -> Result<Vec<MethodRow>> {
         let bar = progress::bar(scenarios.len(), "scenes");
         let mut tallies = vec![PairTally::default(); methods.len()];
-        for scenario in scenarios {
+        for (scenario, range_m) in scenarios {
             let ticks = (0..scenario.ticks.len())
                 .step_by(self.every as usize)
-                .take(self.frames.unwrap_or(usize::MAX));
-            let lost = alignment::run(methods, boxes, scenario, ticks, &mut |outcome| {
+                .take(self.frames.map_or(usize::MAX, |frames| frames as usize));
+            let scene = (scenario, *range_m);
+            let lost = alignment::run(methods, boxes, scene, ticks, &mut |outcome| {
                 tallies[outcome.method].add(&outcome);
             })?;
             left_out.merge(&lost);

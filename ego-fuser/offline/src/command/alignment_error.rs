@@ -27,8 +27,8 @@ pub(crate) struct Arguments {
     #[arg(long, value_delimiter = ',', default_value = "1,2")]
     turns_deg: Vec<f64>,
     /// Take every N-th tick of each scenario.
-    #[arg(long, value_name = "N", default_value_t = 1)]
-    every: usize,
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
+    every: u32,
     /// Seed of the directions.
     #[arg(long, default_value_t = 0)]
     seed: u64,
@@ -54,11 +54,13 @@ impl Arguments {
         let weights = Weights::load(&self.weights).map_err(BadInput::of)?;
         let mut meter = AlignmentMeter::load(&weights).map_err(BadInput::of)?;
         let mut left_out = LeftOut::default();
-        let scenarios = self.data.scenarios(&mut left_out)?;
-        let found = meter.measure(&scenarios, self.every, &offsets, self.seed, &mut left_out)?;
+        let scenarios = self.data.arranged(&mut left_out)?;
+        let every = self.every as usize;
+        let found = meter.measure(&scenarios, every, &offsets, self.seed, &mut left_out)?;
         if self.json {
             let weights = [self.weights.clone()];
-            output::line(rows_with_provenance(&found, &scenarios, weights)?)?;
+            let scenarios = scenarios.iter().map(|(scenario, _)| scenario);
+            output::line(rows_with_provenance(&found, scenarios, weights)?)?;
         } else {
             output::text(table(&found))?;
         }

@@ -1,15 +1,16 @@
 //! `ego-fuser eval`: AP of a method on recorded scenes.
 
+use std::collections::BTreeSet;
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 
-use super::{DataSets, print_left_out, rows_with_provenance};
+use super::{DataSets, EvalSet, print_left_out, rows_with_provenance};
 use anyhow::Result;
 use dataset::average_precision::{Ordering, Scorer, THRESHOLDS};
 use dataset::evaluation_protocol::{EvaluationProtocol, ProtocolConfig};
 use dataset::frame::Frame;
-use dataset::ground_truth::GroundTruth;
-use dataset::{LeftOut, LoadOptions, Scenario};
+use dataset::ground_truth::{self, GroundTruth};
+use dataset::{LeftOut, LoadOptions};
 use ego_fuser_offline::evaluation::{EvaluatedFrame, Evaluator, Setup, without_true_pose};
 use ego_fuser_offline::multi_scale::{MULTI_SCALE_KIND, OfflineDetector};
 use fusion::Method;
@@ -18,11 +19,10 @@ use perception::weights::{KIND_KEY, Weights};
 use serde_json::{Value, json};
 use support::cli::{BadInput, Outcome};
 use support::output;
+use support::sampling::repeated;
+use support::statistics::mean;
 use terminal::progress;
 use terminal::text_table::number;
-
-/// A data set's evaluation protocol and scenarios.
-type EvalSet = (EvaluationProtocol, Vec<Scenario>);
 
 /// Measures AP on datasets, with true poses, without delay and without loss.
 #[derive(Debug, clap::Args)]
@@ -44,7 +44,7 @@ pub(crate) struct Arguments {
     #[command(flatten)]
     protocol: ProtocolConfig,
     /// Torch threads.
-    #[arg(long, default_value_t = 1)]
+    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=256))]
     threads: u16,
     /// Print JSON.
     #[arg(long)]
@@ -54,9 +54,14 @@ pub(crate) struct Arguments {
 impl Arguments {
     /// Evaluates and prints a line per method.
     pub(crate) fn run(self) -> Result<Outcome> {
-        tch::set_num_threads(i32::from(self.threads.max(1)));
+        tch::set_num_threads(i32::from(self.threads));
         let mut left_out = LeftOut::default();
-        let data = self.open(&mut left_out)?;
+        if let Some(twice) = repeated(&self.method) {
+            return Err(BadInput::new(format!("--method names {twice} twice")).into());
+        }
+        let frames = self.frames.map(|frames| frames as usize);
+        let protocol = Some(&self.protocol);
+        let data = self.data.evaluated(&mut left_out, protocol, frames)?;
         let weights = Weights::load(&self.weights).map_err(BadInput::of)?;
         let (rows, area_m) = if weights.metadata(KIND_KEY) == Some(MULTI_SCALE_KIND) {
             self.evaluate_multi_scale(&data, &mut left_out)?
@@ -71,27 +76,14 @@ impl Arguments {
             }
             (rows, weights.detector_config()?.lidar_range_m)
         };
+        let protocols: Vec<_> = data.iter().map(|(one, _)| one.within(area_m)).collect();
         if self.json {
-            self.print_json(rows, &data, area_m)?;
+            self.print_json(rows, &data, &protocols)?;
+        } else {
+            let lines: BTreeSet<String> = protocols.iter().map(ToString::to_string).collect();
+            lines.into_iter().try_for_each(output::line)?;
         }
         Ok(print_left_out(&left_out))
-    }
-
-    /// The data sets, each with the agents of its protocol.
-    fn open(&self, left_out: &mut LeftOut) -> Result<Vec<EvalSet>> {
-        let mut all = Vec::with_capacity(self.data.data.len());
-        for opened in self.data.open(left_out, Some(&self.protocol))? {
-            let protocol = self.protocol.resolve(opened.layout);
-            let protocol = protocol.map_err(BadInput::new)?;
-            let scenarios = opened.scenarios.iter();
-            let mut scenarios: Vec<_> = scenarios.filter_map(|it| protocol.arrange(it)).collect();
-            for scenario in &mut scenarios {
-                let most = self.frames.map_or(usize::MAX, |frames| frames as usize);
-                scenario.ticks.truncate(most);
-            }
-            all.push((protocol, scenarios));
-        }
-        Ok(all)
     }
 
     /// Row and area of a network that fuses at every level: it is one method of its own.
@@ -125,8 +117,12 @@ impl Arguments {
                     left_out.add_unreadable(0, without_true_pose(scenario, tick, &frames[0].cav));
                     continue;
                 }
-                let truth = GroundTruth::of_tick(&frames.iter().collect::<Vec<_>>(), 0, &rule);
-                let (detections, sent_bytes) = match detector.detect(&frames) {
+                let all: Vec<&Frame> = frames.iter().collect();
+                let truth = GroundTruth::of_tick(&all, 0, &rule);
+                let near = ground_truth::contributors(&all, 0, rule.comm_range_m);
+                let frames = frames.into_iter().enumerate();
+                let near = frames.filter_map(|(place, it)| near.contains(&place).then_some(it));
+                let (detections, sent_bytes) = match detector.detect(&Vec::from_iter(near)) {
                     Err(error) if error.is_of_frame() => {
                         let stem = &scenario.ticks[tick].stem;
                         let frame = format!("scenario {}, tick {stem}", scenario.name);
@@ -137,9 +133,11 @@ impl Arguments {
                 };
                 tally.frames += 1;
                 tally.scorer.add(&detections, &truth);
+                let sent_bytes = sent_bytes.into_iter().map(|bytes| bytes as f64);
                 tally.payload_bytes.extend(sent_bytes);
             }
         }
+        left_out.add_scores("multi_scale", &tally.scorer);
         let row = self.row(&tally, "multi_scale")?;
         Ok((vec![row], detector.config().lidar_range_m))
     }
@@ -176,6 +174,7 @@ impl Arguments {
             bar.finish_and_clear();
             left_out.merge(&evaluator.left_out);
         }
+        left_out.add_scores(name, &tally.scorer);
         Ok(self.row(&tally, name)?)
     }
 
@@ -191,7 +190,7 @@ impl Arguments {
                 "{:<10} AP@0.3/0.5/0.7 global {global}, frame order {frame}, {} frames, {} bytes a neighbour",
                 row["method"].as_str().unwrap_or_default(),
                 row["frames"],
-                row["payload_bytes_mean"]
+                number(row["payload_bytes_mean"].as_f64(), 1)
             ))?;
         }
         Ok(row)
@@ -199,11 +198,14 @@ impl Arguments {
 
     /// Prints rows as JSON with the protocol of each data set, as it applies to the area of the network, and with
     /// command and digests of the program, the weights, the scripts and the evaluated data.
-    fn print_json(&self, mut rows: Vec<Value>, data: &[EvalSet], area_m: [f64; 6]) -> Result<()> {
-        let protocols = data.iter().map(|(protocol, _)| protocol.within(area_m));
-        let protocols = json!(protocols.collect::<Vec<_>>());
+    fn print_json(
+        &self,
+        mut rows: Vec<Value>,
+        data: &[EvalSet],
+        protocols: &[EvaluationProtocol],
+    ) -> Result<()> {
         for row in &mut rows {
-            row["protocols"] = protocols.clone();
+            row["protocols"] = json!(protocols);
         }
         let scripts = self.method.iter().filter_map(|method| method.script_file());
         let files = scripts.chain([self.weights.as_path()]).map(Path::to_owned);
@@ -218,19 +220,20 @@ impl Arguments {
 struct MethodTotals {
     scorer: Scorer,
     frames: usize,
-    payload_bytes: Vec<u64>,
+    payload_bytes: Vec<f64>,
 }
 
 impl MethodTotals {
     /// Adds a frame. One that failed has no result to add, one without the ego's true pose nothing to compare it with.
     fn add(&mut self, frame: &EvaluatedFrame) {
-        if frame.failure.is_some() || !frame.has_true_pose() {
+        if frame.failure.is_some() || frame.true_pose().is_none() {
             return;
         }
         self.frames += 1;
         self.scorer.add(&frame.result.detections, &frame.truth);
         let fused = frame.result.fused.iter();
-        self.payload_bytes.extend(fused.map(|it| it.payload_bytes));
+        let bytes = fused.map(|it| it.payload_bytes as f64);
+        self.payload_bytes.extend(bytes);
     }
 
     fn row(&self, method: &str) -> Value {
@@ -240,14 +243,13 @@ impl MethodTotals {
             let by_iou = by_iou.map(|(iou, ap)| (iou.to_string(), json!(ap)));
             by_iou.collect::<serde_json::Map<_, _>>()
         });
-        let bytes =
-            self.payload_bytes.iter().sum::<u64>() as f64 / self.payload_bytes.len().max(1) as f64;
         json!({
             "method": method,
             "frames": self.frames,
             "ap_global": global,
             "ap_frame_order": frame_order,
-            "payload_bytes_mean": bytes,
+            // Unknown, rather than 0, where no neighbour sent anything.
+            "payload_bytes_mean": mean(&self.payload_bytes),
         })
     }
 }
@@ -261,12 +263,13 @@ mod tests {
     use super::*;
 
     #[test]
-    fn without_objects_ap_is_null() {
+    fn without_objects_and_neighbours_ap_and_bytes_are_null() {
         let row = MethodTotals::default().row("late");
         assert_eq!(
             row["ap_global"],
             json!({"0.3": null, "0.5": null, "0.7": null})
         );
+        assert_eq!(row["payload_bytes_mean"], Value::Null);
     }
 
     #[test]

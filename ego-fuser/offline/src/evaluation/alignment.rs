@@ -14,8 +14,8 @@ use protocol::message::Message;
 use protocol::{Box3d, HEADER_LEN, wire};
 
 use super::participant::stamp;
+use super::sweeps::without_true_pose;
 use crate::alignment::{AlignError, AlignInput, AlignmentMethod, AlignmentSpec, NotAligned};
-use ego_fuser::ego::Ego;
 
 /// Source of boxes.
 #[derive(Debug)]
@@ -49,15 +49,16 @@ pub struct PairError {
     pub degrees: f64,
 }
 
-/// Compares methods on the ticks of a scenario in `ticks`; reports every pair when it is done. Returns the frames that
-/// cannot be read; without the ego's its tick is left out.
+/// Compares methods on the ticks of a scenario in `ticks`, for neighbours within the communication range, metres; reports
+/// every pair when it is done. Returns the frames that cannot be read or have no true pose; without the ego's its tick is
+/// left out.
 ///
 /// # Errors
-/// [`AlignError`] at the first frame that has no true pose.
+/// [`AlignError`] of a method.
 pub fn run(
     specs: &[AlignmentSpec],
     box_source: &mut BoxSource,
-    scenario: &Scenario,
+    (scenario, comm_range_m): (&Scenario, f64),
     ticks: impl Iterator<Item = usize>,
     on_outcome: &mut dyn FnMut(PairOutcome),
 ) -> Result<LeftOut, AlignError> {
@@ -68,20 +69,29 @@ pub fn run(
         let agents = scenario.present_agents(tick);
         let loaded = scenario.load_tick(tick, agents, &LoadOptions::default());
         left_out.add_tick(&loaded);
-        if loaded.frames.first().is_none_or(|(agent, _)| *agent != 0) {
+        let (mut frames, mut truth) = (Vec::<Frame>::new(), Vec::new());
+        for (agent, frame) in loaded.frames {
+            match frame.world_from_lidar {
+                Some(pose) => {
+                    truth.push(pose.isometry());
+                    frames.push(frame);
+                }
+                None if agent == 0 => {
+                    left_out.add_unreadable(0, without_true_pose(scenario, tick, &frame.cav));
+                }
+                None => {
+                    let (scene, stem) = (&scenario.name, &scenario.ticks[tick].stem);
+                    let place = format!("scenario {scene}, tick {stem}, agent {}", frame.cav);
+                    left_out.add_failed(&place, "no true pose to compare with");
+                }
+            }
+        }
+        if frames.first().map(|ego| &ego.cav) != scenario.agents.first() {
             continue;
         }
-        let frames: Vec<Frame> = loaded.frames.into_iter().map(|(_, frame)| frame).collect();
-        let truth = frames.iter().map(|frame| {
-            let pose = frame.world_from_lidar.map(|pose| pose.isometry());
-            pose.ok_or_else(|| {
-                let (scenario, stem) = (&scenario.name, &scenario.ticks[tick].stem);
-                AlignError::NoTruth(format!("{scenario}, {stem}: agent {}", frame.cav))
-            })
-        });
-        let truth = truth.collect::<Result<Vec<_>, _>>()?;
         let boxes = needs_boxes.then_some(&mut *box_source);
-        moment(&mut methods, boxes, &frames, &truth, on_outcome)?;
+        let at = (&frames[..], &truth[..]);
+        moment(&mut methods, boxes, at, comm_range_m, on_outcome)?;
     }
     Ok(left_out)
 }
@@ -90,15 +100,12 @@ pub fn run(
 fn moment(
     methods: &mut [Box<dyn AlignmentMethod>],
     mut box_source: Option<&mut BoxSource>,
-    frames: &[Frame],
-    truth: &[Isometry3<f64>],
+    (frames, truth): (&[Frame], &[Isometry3<f64>]),
+    comm_range_m: f64,
     on_outcome: &mut dyn FnMut(PairOutcome),
 ) -> Result<(), AlignError> {
     let ego_from: Vec<Isometry3<f64>> = truth.iter().map(|pose| truth[0].inv_mul(pose)).collect();
-    // The ego is at distance 0, so it is always the first.
-    let near: Vec<usize> = (0..frames.len())
-        .filter(|&index| ego_from[index].translation.vector.norm() <= Ego::COMM_RANGE_M)
-        .collect();
+    let near = ground_truth::contributors(&frames.iter().collect::<Vec<_>>(), 0, comm_range_m);
     let boxes = near
         .iter()
         .map(|&index| match &mut box_source {
@@ -175,5 +182,44 @@ fn boxes(
             });
             Ok(found)
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+
+    use super::*;
+
+    const PCD: &str = "VERSION 0.7\nFIELDS x y z intensity\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 1\nWIDTH 1\n\
+                       HEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS 1\nDATA ascii\n1 2 3 0.5\n";
+
+    #[test]
+    fn frames_without_a_true_pose_are_left_out_and_named() {
+        let folder = tempfile::tempdir().unwrap();
+        // The ego has no pose at tick 1, its neighbour none at tick 2.
+        for (agent, lacking) in [("1", 1), ("2", 2)] {
+            let of_agent = folder.path().join(agent);
+            fs::create_dir(&of_agent).unwrap();
+            for tick in 0..4 {
+                let pose = match tick == lacking {
+                    true => "",
+                    false => "lidar_pose: [0, 0, 2, 0, 0, 0]\n",
+                };
+                let yaml = format!("{pose}vehicles: {{}}\n");
+                fs::write(of_agent.join(format!("{tick:06}.yaml")), yaml).unwrap();
+                fs::write(of_agent.join(format!("{tick:06}.pcd")), PCD).unwrap();
+            }
+        }
+        let scenario = dataset::open(folder.path()).unwrap().scenarios.remove(0);
+        let mut annotated = BoxSource::Annotated;
+        let left_out = run(&[], &mut annotated, (&scenario, 70.0), 0..4, &mut |_| {}).unwrap();
+        assert_eq!((left_out.ticks, left_out.failed), (1, 1));
+        let reasons = left_out.reasons();
+        assert!(
+            reasons.contains("no true pose of the ego 1")
+                && reasons.contains("tick 000002, agent 2: no true pose"),
+            "{reasons}"
+        );
     }
 }

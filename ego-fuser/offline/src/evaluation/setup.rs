@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use agent::attack::AttackConfig;
 use agent::config::{AgentSettings, ModelConfig};
 use dataset::evaluation_protocol::EvaluationProtocol;
-use dataset::{Scenario, Tick};
+use dataset::{Scenario, Tick, period_nanos};
 use ego_fuser::config::EgoSettings;
 use ego_fuser::ego_loop::LoopOptions;
 use ego_fuser::pairing::PairingConfig;
@@ -14,7 +14,6 @@ use fusion::method::Method;
 use link::{LatencyModel, LinkConfig, LinkEmulator, LinkError};
 use protocol::CavId;
 use support::random::scenario_seed;
-use support::statistics;
 
 use super::stepped::ComputeTimes;
 
@@ -108,6 +107,12 @@ impl Setup {
         LinkEmulator::new(link.config.clone(), &link.folder, seed)
     }
 
+    /// True if results have a latency. Without a link no time passes; without a compute time a result is as old as its
+    /// sweep by definition.
+    pub fn is_timed(&self) -> bool {
+        self.link.is_some() && self.compute != ComputeTimes::default()
+    }
+
     /// Options of an ego's loop in a scenario.
     pub(super) fn loop_options(&self, scenario: &Scenario) -> LoopOptions {
         let options = LoopOptions::stepped(&self.ego);
@@ -135,10 +140,7 @@ fn max_age_nanos(delay_nanos: u64, live_nanos: u64, ticks: &[Tick]) -> u64 {
     if delay_nanos == 0 {
         return live_nanos;
     }
-    let step = |pair: &[Tick]| pair[1].capture_nanos.saturating_sub(pair[0].capture_nanos) as f64;
-    let steps = ticks.windows(2).map(step);
-    // A pause in the recording must not make every map young enough.
-    let step_nanos = statistics::median(&Vec::from_iter(steps)).unwrap_or(0.0) as u64;
+    let step_nanos = period_nanos(ticks).unwrap_or(0);
     delay_nanos.saturating_add(live_nanos.max(step_nanos.saturating_sub(1)))
 }
 
@@ -164,6 +166,27 @@ mod tests {
     use super::*;
 
     const MS: u64 = 1_000_000;
+
+    #[test]
+    fn results_have_a_latency_over_a_link_with_a_compute_time() {
+        let compute = ComputeTimes {
+            fuse_ms: 1.0,
+            ..ComputeTimes::default()
+        };
+        let ideal = EmulatedLink::open("ideal", 0).unwrap();
+        for (link, compute, is_timed) in [
+            (None, compute, false),
+            (Some(ideal.clone()), ComputeTimes::default(), false),
+            (Some(ideal), compute, true),
+        ] {
+            let setup = Setup {
+                link,
+                compute,
+                ..Setup::default()
+            };
+            assert_eq!(setup.is_timed(), is_timed, "{compute:?}");
+        }
+    }
 
     #[test]
     fn a_pause_in_a_recording_makes_no_old_map_young_enough() {

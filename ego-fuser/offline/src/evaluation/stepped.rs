@@ -14,6 +14,7 @@ use std::time::Duration;
 use dataset::frame::Frame;
 use dataset::ground_truth::GroundTruth;
 use dataset::{LoadOptions, Scenario};
+use link::Packet;
 use protocol::{CavId, Detections, PoseEstimate, StageTiming, Stream, Tracks};
 
 pub use compute::{ComputeTimes, EstimatedTimes};
@@ -280,7 +281,7 @@ impl<'a> SteppedRun<'a> {
         }
         let frame = self.evaluated(tick, decided_nanos, computed, fused);
         // The vehicle has driven on, but its result cannot be compared with anything.
-        if !frame.has_true_pose() {
+        if frame.true_pose().is_none() {
             let problem = without_true_pose(self.scenario, tick, &frame.stamp.cav);
             self.evaluator.left_out.add_unreadable(0, problem);
         }
@@ -470,10 +471,8 @@ fn exact_reception(cav: &CavId, arrived_nanos: u64) -> Reception {
     }
 }
 
-/// Distance between two vehicles, metres; 0 where the recording has no poses.
+/// Distance between two vehicles, metres.
 fn distance_m(one: &Frame, other: &Frame) -> f64 {
-    match [one, other].map(|frame| frame.world_from_lidar.map(|pose| pose.translation_m)) {
-        [Some(one), Some(other)] => (one[0] - other[0]).hypot(one[1] - other[1]),
-        _ => 0.0,
-    }
+    let positions_m = [one, other].map(|frame| Some(frame.world_from_lidar?.translation_m));
+    Packet::distance_m(positions_m)
 }

@@ -1,7 +1,7 @@
 //! Sweeps of one tick: the frames of all agents that take part, with their kept feature maps.
 
 use dataset::frame::Frame;
-use dataset::{LoadOptions, Problem, ReadError, Scenario};
+use dataset::{LeftOut, LoadOptions, Problem, ReadError, Scenario};
 use protocol::CavId;
 use tch::Tensor;
 
@@ -74,6 +74,28 @@ impl Evaluator {
     }
 }
 
+/// Counts a tick at which a live run had no true pose of the ego: its frame is absent, cannot be read, or lacks the pose.
+pub fn add_unplaced_tick(
+    left_out: &mut LeftOut,
+    scenario: &Scenario,
+    (tick, ego): (usize, &CavId),
+    variant: Option<&str>,
+) {
+    let place = scenario.agents.iter().position(|agent| agent == ego);
+    let place = place.unwrap_or(usize::MAX);
+    let options = LoadOptions {
+        // With a pose its sweep is at fault.
+        points: scenario.has_poses(place, tick),
+        lidar_variant: variant.map(str::to_owned),
+        ..LoadOptions::default()
+    };
+    match scenario.load(place, tick, &options) {
+        Ok(_) => left_out.add_unreadable(0, without_true_pose(scenario, tick, ego)),
+        Err(error) if error.is_absent() => left_out.absent_frames += 1,
+        Err(error) => left_out.add_unreadable(0, Problem::from(&error)),
+    }
+}
+
 /// The finding that the recording has no true pose of the ego at a tick: nothing tells where the true boxes are.
 pub fn without_true_pose(scenario: &Scenario, tick: usize, ego: &CavId) -> Problem {
     let place = scenario.agents.iter().position(|agent| agent == ego);
@@ -90,4 +112,49 @@ pub fn without_true_pose(scenario: &Scenario, tick: usize, ego: &CavId) -> Probl
 fn rank(agent: usize, places: &[usize]) -> usize {
     let rank = places.iter().position(|&place| place == agent);
     rank.unwrap_or(usize::MAX)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+
+    use super::*;
+
+    const PCD: &str = "VERSION 0.7\nFIELDS x y z intensity\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 1\nWIDTH 1\n\
+                       HEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS 1\nDATA ascii\n1 2 3 0.5\n";
+
+    #[test]
+    fn a_tick_without_the_ego_is_counted_for_its_reason() {
+        let folder = tempfile::tempdir().unwrap();
+        // The ego has no frame at tick 1, no pose at tick 2, and half a sweep at tick 3.
+        for (agent, ticks) in [("1", [0, 1, 2, 3].as_slice()), ("2", &[0, 2, 3])] {
+            let of_agent = folder.path().join(agent);
+            fs::create_dir(&of_agent).unwrap();
+            for &tick in ticks {
+                let is_ego = agent == "2";
+                let yamls = ["lidar_pose: [0, 0, 2, 0, 0, 0]\n", "ego_speed: 36\n"];
+                let yaml = yamls[usize::from(is_ego && tick == 2)];
+                let pcd = &PCD[..PCD.len() - if is_ego && tick == 3 { 6 } else { 0 }];
+                fs::write(of_agent.join(format!("{tick:06}.yaml")), yaml).unwrap();
+                fs::write(of_agent.join(format!("{tick:06}.pcd")), pcd).unwrap();
+            }
+        }
+        let scenario = dataset::open(folder.path()).unwrap().scenarios.remove(0);
+        let ego = CavId::new("2").unwrap();
+        let counted = [1, 2, 3].map(|tick| {
+            let mut left_out = LeftOut::default();
+            add_unplaced_tick(&mut left_out, &scenario, (tick, &ego), None);
+            (left_out.absent_frames, left_out.ticks, left_out.reasons())
+        });
+        let [absent, unposed, unreadable] = &counted;
+        assert_eq!(*absent, (1, 0, String::new()));
+        assert!(
+            unposed.1 == 1 && unposed.2.contains("no true pose of the ego 2"),
+            "{unposed:?}"
+        );
+        assert!(
+            unreadable.1 == 1 && unreadable.2.contains("000003.pcd"),
+            "{unreadable:?}"
+        );
+    }
 }

@@ -15,7 +15,6 @@ use protocol::{Detection, PointCloud, Pose};
 use tch::{Device, no_grad};
 
 use super::{MapAlignment, MultiScaleNetwork};
-use ego_fuser::ego::Ego;
 use fusion::model::ModelError;
 use fusion::points::merge_points;
 
@@ -51,8 +50,8 @@ impl OfflineDetector {
         &self.network.network.config
     }
 
-    /// Detections in the frame of the first vehicle, and the bytes that each of the others that took part had to send:
-    /// those with a pose, in range.
+    /// Detections in the frame of the first of the vehicles in range, and the bytes that each of the others that took part
+    /// had to send: those with a pose.
     ///
     /// # Errors
     /// [`ModelError`] when the tensor library reports an error.
@@ -68,11 +67,8 @@ impl OfflineDetector {
                 continue;
             };
             let pose = world_from_ego.from_world(&world_from_cav);
-            let [x, y, _] = pose.translation_m;
-            if x.hypot(y) <= Ego::COMM_RANGE_M {
-                sweeps.push(self.pillars(&frame.points, &pose));
-                poses.push(pose);
-            }
+            sweeps.push(self.pillars(&frame.points, &pose));
+            poses.push(pose);
         }
         self.boxes(&sweeps, &poses)
     }

@@ -71,7 +71,7 @@ impl SampleConfig {
             poses: SamplePoses::default(),
             moments: Moments::default(),
             max_agents: 5,
-            comm_range_m: 70.0,
+            comm_range_m: GroundTruthRule::OPV2V.comm_range_m,
             classes: ClassSet::VEHICLES,
             merged_truth: false,
         }
@@ -308,11 +308,11 @@ impl SampleBuilder {
         let Some(ego_frame) = &frames[ego] else {
             return Ok(agents);
         };
-        let [ego_x, ego_y, _] = self.world_from_lidar(tick, ego_frame)?.translation_m;
+        let ego_pose = self.world_from_lidar(tick, ego_frame)?;
         for (agent, frame) in frames.iter().enumerate() {
             let Some(frame) = frame else { continue };
-            let [x, y, _] = self.world_from_lidar(tick, frame)?.translation_m;
-            let in_reach = (x - ego_x).hypot(y - ego_y) <= self.config.comm_range_m;
+            let pose = self.world_from_lidar(tick, frame)?;
+            let in_reach = ego_pose.planar_distance_m(&pose) <= self.config.comm_range_m;
             // Drawn for every vehicle, in reach or not: later draws do not depend on distances.
             let dropped = rng.random_bool(self.config.drop_neighbour);
             if agent != ego && in_reach && !dropped && agents.len() < self.config.max_agents {

@@ -2,6 +2,7 @@
 
 use protocol::{Box3d, Detection, Pose, Track, TrueObject};
 
+use super::motion::pose_covariance;
 use crate::cdr;
 use crate::cdr::Cdr;
 
@@ -28,8 +29,8 @@ pub(crate) fn detections(nanos: u64, frame_id: &str, detections: &[Detection]) -
 /// Tracks in the frame `frame_id`, each with its identity and the covariance of its place. The type has no velocity.
 pub(crate) fn tracks(nanos: u64, frame_id: &str, tracks: &[Track]) -> Vec<u8> {
     let found = tracks.iter().map(|track| {
-        // Rows of x, y, z and the rotations: a track has a covariance of x and y only.
-        let mut covariance = [[0.0; 6]; 6];
+        // A track has a covariance of x and y only.
+        let mut covariance = pose_covariance(None);
         let [[xx, xy, ..], [_, yy, ..], ..] = track.covariance.map(|row| row.map(f64::from));
         (covariance[0][0], covariance[0][1]) = (xx, xy);
         (covariance[1][0], covariance[1][1]) = (xy, yy);
@@ -204,6 +205,7 @@ mod tests {
         for bytes in [
             b"\x04\0\0\x00417\0".to_vec(),
             f64_bytes(&[0.5, 0.25]),
+            f64_bytes(&[1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1e6]),
             f64_bytes(&[0.75]),
         ] {
             assert!(

@@ -43,7 +43,7 @@ pub(crate) fn odometry(
 }
 
 /// Covariance of a pose, rows of x, y, z and of the rotations about them, of which position and yaw in the plane are measured.
-fn pose_covariance(planar: Option<&PlanarCovariance>) -> [[f64; 6]; 6] {
+pub(super) fn pose_covariance(planar: Option<&PlanarCovariance>) -> [[f64; 6]; 6] {
     // Height, roll and pitch have no variance in a planar covariance.
     let mut rows = diagonal([UNMEASURED; 6]);
     let [x, y, _, _, _, yaw] = &mut rows;

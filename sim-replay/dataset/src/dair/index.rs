@@ -21,6 +21,9 @@ pub(super) const FILES: [&str; 3] = [COOPERATIVE, CAPTURES, UNIT_CAPTURES];
 /// Times between two sweeps that are no pair, seconds. Those published are up to some 50 ms apart. Clocks with other
 /// starts or time zones are an hour apart or more, and say nothing of pairs.
 const APART_S: Range<f64> = 0.2..3600.0;
+/// Median time between the sweeps of pairs that are one frame of 10 Hz apart at least, seconds; published ones differ by
+/// less, and the next sweep of a side is 0.1 s away.
+const ONE_FRAME_S: f64 = 0.075;
 /// Largest `data_info.json` that is read, bytes. Those published have up to 20 MB.
 const MAX_BYTES: u64 = 512 << 20;
 
@@ -91,15 +94,17 @@ impl Index {
         let captures = read_captures(&root.join(CAPTURES), kind, problems);
         // The times of the unit only tell which pairs are none: a data set without them is whole.
         let of_unit = read_captures(&root.join(UNIT_CAPTURES), kind, &mut Vec::new());
-        let mut faults = Faults::default();
+        let (mut faults, mut gaps_s) = (Faults::default(), Vec::new());
         let has_times = captures.values().any(|capture| capture.micros.is_some());
         let mut groups: BTreeMap<String, Vec<(u64, FramePair)>> = BTreeMap::new();
         let (noun, _) = kind.group();
         for pair in pairs {
-            if let Some(reason) = apart(&pair, &captures, &of_unit) {
+            let times = times_s(&pair, &captures, &of_unit);
+            if let Some(reason) = times.and_then(|times_s| apart(&pair, times_s)) {
                 faults.push(ReadError::malformed(&path, reason));
                 continue;
             }
+            gaps_s.extend(times.map(|[time_s, unit_s]| (time_s - unit_s).abs()));
             let capture = captures.get(&pair.vehicle);
             let group = capture.and_then(|capture| capture.group.as_ref());
             let name = match group.or(pair.sequence.as_ref()) {
@@ -119,17 +124,35 @@ impl Index {
             }
         }
         faults.report("pair", problems);
+        problems.extend(one_frame_off(&path, &gaps_s));
         let groups = groups.into_iter().filter(|(_, all)| !all.is_empty());
         let groups = groups.map(|(name, all)| (name, in_order(all))).collect();
         Ok(Self { kind, groups })
     }
 }
 
-/// The reason why the frames of a pair are not of one time, where both times are known.
-fn apart(pair: &FramePair, captures: &Captures, of_unit: &Captures) -> Option<String> {
+/// The problem that the sweeps of pairs are a frame apart, by the times between those of each pair, seconds.
+fn one_frame_off(path: &Path, gaps_s: &[f64]) -> Option<ReadError> {
+    let gap_s = statistics::median(gaps_s)?;
+    (ONE_FRAME_S..APART_S.end).contains(&gap_s).then(|| {
+        let reason = format!(
+            "the frames of a pair are {gap_s:.3} s apart in the median, expected less than {ONE_FRAME_S} s: pairs one \
+             frame off, or clocks that differ"
+        );
+        ReadError::malformed(path, reason)
+    })
+}
+
+/// Times of vehicle and unit of a pair, seconds, where both are known.
+fn times_s(pair: &FramePair, captures: &Captures, of_unit: &Captures) -> Option<[f64; 2]> {
     let time_s = |captures: &Captures, id: &str| Some(captures.get(id)?.micros? as f64 * 1e-6);
+    let unit_s = time_s(of_unit, &pair.infrastructure)?;
+    Some([time_s(captures, &pair.vehicle)?, unit_s])
+}
+
+/// The reason why the frames of a pair are not of one time.
+fn apart(pair: &FramePair, [time_s, unit_s]: [f64; 2]) -> Option<String> {
     let [vehicle, unit] = [&pair.vehicle, &pair.infrastructure];
-    let (time_s, unit_s) = (time_s(captures, vehicle)?, time_s(of_unit, unit)?);
     APART_S.contains(&(time_s - unit_s).abs()).then(|| {
         format!(
             "vehicle frame {vehicle} at {time_s:.3} s with frame {unit} of the unit at {unit_s:.3} s, expected at \

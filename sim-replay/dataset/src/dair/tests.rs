@@ -666,6 +666,13 @@ fn pairs_of_two_times_are_left_out() {
         of_unit([T0_MICROS + 30_000, T0_MICROS + 1_100_000]),
         (1, vec![expected.to_owned()])
     );
+    // Each with the frame of the unit before it.
+    let expected = "cooperative/data_info.json: the frames of a pair are 0.100 s apart in the median, expected less than \
+                    0.075 s: pairs one frame off, or clocks that differ";
+    assert_eq!(
+        of_unit([T0_MICROS - 100_000, T0_MICROS]),
+        (2, vec![expected.to_owned()])
+    );
     for sound in [
         [T0_MICROS + 30_000, T0_MICROS + 60_000],
         // A clock of its own.

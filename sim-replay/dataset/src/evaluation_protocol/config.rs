@@ -53,8 +53,19 @@ impl ProtocolConfig {
     /// # Errors
     /// A message with the option and both values.
     pub fn resolve(&self, layout: Layout) -> Result<EvaluationProtocol, String> {
+        self.resolve_over(None, layout)
+    }
+
+    /// The same for a run that was scored: without a preset the changes are over the protocol of its scores.
+    pub(super) fn resolve_over(
+        &self,
+        scored: Option<EvaluationProtocol>,
+        layout: Layout,
+    ) -> Result<EvaluationProtocol, String> {
         let name = self.preset.as_deref().unwrap_or(layout.0.protocol);
-        let mut protocol = EvaluationProtocol::preset(name).ok_or_else(|| {
+        let scored = scored.filter(|_| self.preset.is_none());
+        let start = scored.or_else(|| EvaluationProtocol::preset(name));
+        let mut protocol = start.ok_or_else(|| {
             let known: Vec<&str> = PRESETS.iter().map(|(name, _)| *name).collect();
             format!("unknown protocol {name:?}; there are {}", known.join(", "))
         })?;

@@ -1,9 +1,11 @@
 //! Plausibility of annotated boxes as a whole: boxes in wrong frames or units can be valid one by one.
 
+use std::collections::BTreeSet;
+
 use protocol::{CavId, PointCloud, Pose};
 
 use super::cells::PointCells;
-use super::lists::FramesOfTicks;
+use super::lists::{FramesOfTicks, distance_m};
 use crate::frame::{Frame, Object, ObjectClass};
 use crate::ground_truth::{self, GroundTruthRule};
 use crate::{Problem, Scenario};
@@ -21,14 +23,21 @@ const LEAST_EMPTY_RATIO: usize = 3;
 const NARROWEST_CAR_M: f64 = 1.2;
 /// Least length of a car, relative to its width and height, with room for errors of sizes.
 const LEAST_LENGTH: f64 = 0.9;
+/// Ratio of height to width above which a vehicle of at most this length, metres, is no car. Vans labelled as cars are
+/// longer, or few.
+const HIGHEST: f64 = 1.15;
+const SHORT_M: f64 = 5.2;
+/// Least number of different vehicles for it: one van may be alone in all frames.
+const SEVERAL: usize = 8;
 /// Length and width above which a vehicle is no car, metres. Buses and trucks are as long, but not as wide.
 const LONG_M: f64 = 7.0;
 const WIDE_M: f64 = 3.2;
 /// Largest distance of an agent's box from that of the same vehicle in a cooperative list, metres: half a car's length
 /// is more.
 const SAME_VEHICLE_M: f64 = 1.5;
-/// Vehicles that an agent lists for each one that the cooperative list has, too, at most: it holds nearly all of them.
-const MOST_PER_COMMON: usize = 10;
+/// Vehicles that an agent lists for each one that the cooperative list has, too, at most: it holds nearly all of them,
+/// except those far from the ego.
+const MOST_PER_COMMON: usize = 3;
 const HINT: &str = "frames (axes, order of the pose's numbers) or units of the boxes may be wrong";
 
 /// The finding that agents list objects of the rule's classes, and none is ground truth of any ego. Without poses it
@@ -74,8 +83,9 @@ pub(super) fn unlike_cooperative(
         };
         let vehicles = frame.objects.iter();
         for vehicle in vehicles.filter(|object| ObjectClass::VEHICLES.contains(&object.class)) {
+            let mut others = list.iter();
             own += 1;
-            common += usize::from(list.iter().any(|other| is_near(vehicle, other)));
+            common += usize::from(others.any(|other| distance_m(vehicle, other) < SAME_VEHICLE_M));
         }
     }
     let reason = format!(
@@ -84,12 +94,6 @@ pub(super) fn unlike_cooperative(
     );
     (own >= ENOUGH_BOXES.max(MOST_PER_COMMON * common))
         .then(|| Problem::about(scenario, "cooperative labels", &reason))
-}
-
-fn is_near(one: &Object, other: &Object) -> bool {
-    let [[x, y, _], [other_x, other_y, _]] =
-        [one, other].map(|object| object.world_from_object.translation_m);
-    (x - other_x).hypot(y - other_y) < SAME_VEHICLE_M
 }
 
 /// True if there are objects whose place relative to the LiDAR is unknown.
@@ -104,10 +108,11 @@ pub(super) fn unlike_cars<'a>(
     objects: impl Iterator<Item = &'a Object>,
 ) -> Option<Problem> {
     let cars = objects.filter(|object| object.class == ObjectClass::Car);
-    let sizes: Vec<[f64; 3]> = (cars.map(|object| object.size_m))
-        .filter(|[length, width, _]| length.min(*width) >= NARROWEST_CAR_M)
-        .collect();
-    let wrong = (sizes.iter()).filter_map(|size| Some((size, form_fault(*size)?)));
+    let (ids, sizes): (BTreeSet<i64>, Vec<[f64; 3]>) = (cars.map(|car| (car.id, car.size_m)))
+        .filter(|(_, [length, width, _])| length.min(*width) >= NARROWEST_CAR_M)
+        .unzip();
+    let are_several = ids.len() >= SEVERAL;
+    let wrong = (sizes.iter()).filter_map(|size| Some((size, form_fault(*size, are_several)?)));
     let ([length, width, height], fault) = wrong.clone().next()?;
     let (count, all) = (wrong.count(), sizes.len());
     let reason = format!(
@@ -117,10 +122,13 @@ pub(super) fn unlike_cars<'a>(
     (all >= ENOUGH_BOXES && 2 * count > all).then(|| Problem::about(scenario, "size", &reason))
 }
 
-/// The fault of a car's length, width and height, metres.
-fn form_fault([length, width, height]: [f64; 3]) -> Option<&'static str> {
+/// The fault of a car's length, width and height, metres; it may be one of several.
+fn form_fault([length, width, height]: [f64; 3], are_several: bool) -> Option<&'static str> {
     if length < LEAST_LENGTH * width.max(height) {
         return Some("shorter than wide or high: the order of the sizes");
+    }
+    if are_several && length < SHORT_M && height > HIGHEST * width {
+        return Some("higher than wide: the order of the sizes");
     }
     (length > LONG_M && width > WIDE_M)
         .then_some("larger than any car: half or whole sizes, or their unit,")
@@ -164,7 +172,9 @@ pub(super) fn without_points(frame: &Frame, pose: &Pose, points: &PointCloud) ->
             let object_from_lidar = world_from_object.inv_mul(&world_from_lidar);
             #[expect(clippy::cast_possible_truncation, reason = "rounded to f32")]
             let half = object.size_m.map(|size| (size / 2.0) as f32);
-            !cells.holds_point(&object_from_lidar.cast::<f32>(), half, signs)
+            let object_from_lidar = object_from_lidar.cast();
+            let held = cells.points_in(&object_from_lidar, half, signs).next();
+            held.is_none()
         });
         empty.count()
     })

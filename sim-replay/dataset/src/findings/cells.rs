@@ -40,29 +40,27 @@ impl PointCells {
         Self { points, begins }
     }
 
-    /// True if a box contains a point, once x and y of the points are multiplied by the signs; other arguments are its
-    /// transform from the LiDAR frame and its half sizes.
-    pub(crate) fn holds_point(
+    /// The points in a box, in its frame, once x and y of the points are multiplied by the signs; other arguments are
+    /// its transform from the LiDAR frame and its half sizes.
+    pub(crate) fn points_in(
         &self,
         box_from_lidar: &Isometry3<f32>,
         half: [f32; 3],
         [sign_x, sign_y]: [f32; 2],
-    ) -> bool {
+    ) -> impl Iterator<Item = Point3<f32>> {
         // Slightly larger than the box, to allow for rounding.
         let radius = 1.0 + half.iter().map(|half| half * half).sum::<f32>().sqrt();
         let center = box_from_lidar.inverse().translation.vector;
         let (x, y) = (sign_x * center.x, sign_y * center.y);
         let columns = index(x - radius)..=index(x + radius);
-        let mut rows = index(y - radius)..=index(y + radius);
-        rows.any(|row| {
+        let rows = index(y - radius)..=index(y + radius);
+        rows.flat_map(move |row| {
             // Neighbouring columns of a row are neighbours in memory: one range of points.
             let (first, last) = (row * ACROSS + columns.start(), row * ACROSS + columns.end());
             self.points[self.begins[first]..self.begins[last + 1]]
                 .iter()
-                .any(|&[x, y, z]| {
-                    let local = box_from_lidar * Point3::new(sign_x * x, sign_y * y, z);
-                    (0..3).all(|axis| local[axis].abs() <= half[axis])
-                })
+                .map(move |&[x, y, z]| box_from_lidar * Point3::new(sign_x * x, sign_y * y, z))
+                .filter(move |local| (0..3).all(|axis| local[axis].abs() <= half[axis]))
         })
     }
 }
@@ -103,7 +101,8 @@ mod tests {
                 let local = box_from_lidar * Point3::new(signs[0] * point[0], signs[1] * point[1], point[2]);
                 (0..3).all(|axis| local[axis].abs() <= half[axis])
             });
-            prop_assert_eq!(cells.holds_point(&box_from_lidar, half, signs), expected);
+            let found = cells.points_in(&box_from_lidar, half, signs).next().is_some();
+            prop_assert_eq!(found, expected);
         }
     }
 }

@@ -71,10 +71,8 @@ fn shared_boxes<'a>(ticks: &FramesOfTicks<'a>, agents: [&CavId; 2]) -> Vec<Share
 }
 
 /// Distance of the centres in the plane, metres.
-fn distance_m(one: &Object, other: &Object) -> f64 {
-    let [x, y, _] = one.world_from_object.translation_m;
-    let [other_x, other_y, _] = other.world_from_object.translation_m;
-    (x - other_x).hypot(y - other_y)
+pub(super) fn distance_m(one: &Object, other: &Object) -> f64 {
+    (one.world_from_object).planar_distance_m(&other.world_from_object)
 }
 
 /// The fault of the boxes of two agents together, of all of them or of those that move: parked vehicles hide a late

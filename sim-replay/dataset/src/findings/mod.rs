@@ -4,6 +4,7 @@
 
 mod boxes;
 pub(crate) mod cells;
+mod fit;
 mod lists;
 mod sweeps;
 
@@ -37,11 +38,11 @@ pub struct FrameFindings {
     pub sweep: Option<SweepFindings>,
     /// The frame without points, if it was read.
     pub frame: Option<Frame>,
-    /// Objects of a frame with a pose whose sweep was read.
+    /// Objects of a frame with a pose whose sweep was read, and those near it that are left out as no point hits them.
     placed_boxes: usize,
-    /// Those of them that hold none of the agent's own points.
+    /// Listed objects of such a frame that hold none of the agent's own points.
     pub boxes_without_points: usize,
-    /// The same, and with axes of the points negated.
+    /// Those of the placed boxes that hold none, also with axes of the points negated.
     empty_boxes: EmptyBoxes,
 }
 
@@ -56,9 +57,10 @@ impl FrameFindings {
         if let Some((frame, sweep)) = findings.frame.as_ref().zip(sweep)
             && let Some(pose) = &frame.world_from_lidar
         {
-            findings.placed_boxes = frame.objects.len();
-            findings.empty_boxes = boxes::without_points(frame, pose, &sweep.points);
-            [findings.boxes_without_points, ..] = findings.empty_boxes;
+            let empty = boxes::without_points(frame, pose, &sweep.points);
+            [findings.boxes_without_points, ..] = empty;
+            findings.empty_boxes = empty.map(|count| count + frame.missed_objects);
+            findings.placed_boxes = frame.objects.len() + frame.missed_objects;
         }
         findings
     }
@@ -107,10 +109,13 @@ fn of_objects(
         ticks.entry(*tick).or_default().extend(&findings.frame);
     }
     let mut problems = lists::contradictions(scenario, &ticks);
-    for (id, frames) in scenario.agents.iter().zip(frames) {
-        let read = frames.iter().flat_map(|(_, one)| &one.frame);
-        let objects = read.flat_map(|frame| &frame.objects);
-        problems.extend(boxes::unlike_cars(&scenario.name, id, objects));
+    for (agent, (id, frames)) in scenario.agents.iter().zip(frames).enumerate() {
+        for list in fit::LISTS {
+            let read = frames.iter().flat_map(|(_, one)| &one.frame);
+            let objects = read.flat_map(list.1);
+            problems.extend(boxes::unlike_cars(&scenario.name, id, objects));
+            problems.extend(fit::problem(scenario, (agent, id), list));
+        }
         problems.extend(boxes::unlike_cooperative(&scenario.name, id, &ticks));
     }
     problems.extend(rule.and_then(|rule| boxes::without_ground_truth(scenario, &ticks, rule)));
@@ -158,20 +163,17 @@ pub fn sampled(
     let problems = scenarios.into_iter().flat_map(|scenario| {
         let indices: Vec<usize> = (0..scenario.ticks.len()).collect();
         let ticks = evenly_spread(&indices, ticks);
-        // Agent by agent, so that the results below fall into the lists of agents in order of time.
-        let places: Vec<(usize, usize)> = (0..scenario.agents.len())
-            .flat_map(|agent| ticks.iter().map(move |&tick| (agent, tick)))
-            .collect();
-        let frames: Vec<Option<FrameFindings>> = places
-            .par_iter()
-            .map(|&(agent, tick)| read(scenario, agent, tick))
-            .collect();
-        let mut of_agents = vec![Vec::new(); scenario.agents.len()];
-        for ((agent, tick), frame) in places.into_iter().zip(&frames) {
-            if let (Some(frame), Some(of_agent)) = (frame, of_agents.get_mut(agent)) {
-                of_agent.push((tick, frame));
-            }
-        }
+        let agents = (0..scenario.agents.len()).into_par_iter().map(|agent| {
+            let frames = ticks.par_iter();
+            let frames = frames.filter_map(|&tick| Some((tick, read(scenario, agent, tick)?)));
+            frames.collect::<Vec<(usize, FrameFindings)>>()
+        });
+        let agents: Vec<_> = agents.collect();
+        let of_agents = agents.iter().map(|frames| {
+            let frames = frames.iter().map(|(tick, frame)| (*tick, frame));
+            frames.collect::<Vec<(usize, &FrameFindings)>>()
+        });
+        let of_agents: Vec<_> = of_agents.collect();
         of_scenario(scenario, &of_agents, scale, rule)
     });
     problems.collect()

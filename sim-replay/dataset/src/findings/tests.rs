@@ -133,7 +133,7 @@ fn cooperative_labels_of_another_world_are_named() {
     assert_eq!(finding(None), None);
     assert_eq!(finding(Some(list(1.0))), None);
     let mut one_is_listed = list(2.0);
-    one_is_listed.extend(list(0.0).into_iter().take(3));
+    one_is_listed.extend(list(0.0).into_iter().take(9));
     assert_eq!(finding(Some(one_is_listed)), None);
     let found = finding(Some(list(2.0))).unwrap();
     let start = "scene: agent vehicle: 0 of 25 vehicles that it lists are within 1.5 m of one in the cooperative";
@@ -148,6 +148,91 @@ fn intensities_far_below_one_are_named() {
     let part = "the largest of 800 intensities is 3.80e-3 (field intensity divided by 1), expected 0.02 to 1";
     assert!(found[0].contains(part), "{found:?}");
     assert!(scene_findings(dir.path(), 0, 0.002, None).is_empty());
+}
+
+/// Findings about the fit of boxes in six frames of ten cars of 4.4 x 2 m that drive 1.5 m from each to the next, with
+/// points on their sides. The boxes are turned, multiplied, and those of a frame some frames later.
+fn fit_findings(yaw_deg: f64, scale: f64, late: usize) -> Vec<String> {
+    let dir = tempfile::tempdir().unwrap();
+    let folder = dir.path().join("scene/1");
+    fs::create_dir_all(&folder).unwrap();
+    let place = |car: usize, frame: usize| {
+        let (row, column) = ((car / 5) as f64, (car % 5) as f64);
+        [8.0 * column - 16.0 + 1.5 * frame as f64, 8.0 * row + 6.0]
+    };
+    for frame in 0..6 {
+        let cars = (0..10).map(|car| {
+            let [x, y] = place(car, frame + late);
+            let extent = [2.2, 1.0, 0.8].map(|half| scale * half);
+            let place = format!("location: [{x}, {y}, 0], angle: [0, {yaw_deg}, 0]");
+            format!("  {car}: {{{place}, extent: {extent:?}}}\n")
+        });
+        let yaml = format!(
+            "lidar_pose: [0, 0, 0, 0, 0, 0]\nvehicles:\n{}",
+            cars.collect::<String>()
+        );
+        let points = (0..10 * 17).map(|k| {
+            let ([x, y], part) = (place(k / 17, frame), (k % 17) as f64 / 8.0 - 1.0);
+            let (dx, dy) = (2.2 * part, part);
+            let sides = [(dx, 1.0), (dx, -1.0), (2.2, dy), (-2.2, dy)];
+            let lines = sides.map(|(dx, dy)| format!("{} {} 0.2 0.{}\n", x + dx, y + dy, k % 9));
+            lines.concat()
+        });
+        let cloud = HEAD.replace("WIDTH 20", "WIDTH 680") + &points.collect::<String>();
+        fs::write(folder.join(format!("{frame:06}.yaml")), yaml).unwrap();
+        fs::write(folder.join(format!("{frame:06}.pcd")), cloud).unwrap();
+    }
+    let mut found = messages(dir.path(), None);
+    found.retain(|message| message.contains("the points fit"));
+    found
+}
+
+#[test]
+fn boxes_that_a_change_fits_better_to_the_points_are_named() {
+    assert_eq!(fit_findings(0.0, 1.0, 0), Vec::<String>::new());
+    assert_eq!(fit_findings(180.0, 1.0, 0), Vec::<String>::new());
+    for (found, name) in [
+        (fit_findings(90.0, 1.0, 0), "turned by 90 degrees"),
+        (fit_findings(0.0, 0.5, 0), "twice as large"),
+        (fit_findings(0.0, 1.0, 1), "of the frame before"),
+    ] {
+        let start =
+            format!("scene: agent 1: the points fit boxes {name} better: 1.00 of the structure");
+        assert!(
+            found.len() == 1 && found[0].starts_with(&start),
+            "{found:?}"
+        );
+    }
+}
+
+#[test]
+fn boxes_that_no_change_fits_to_the_points_are_named() {
+    let fault = |share: f64, boxes: usize| {
+        let labels = vec![share; boxes];
+        fit::fault(&fit::Comparisons::from([(
+            "half as large",
+            [labels, vec![share; 19]],
+        )]))
+    };
+    assert_eq!(fault(0.5, 40), None);
+    assert_eq!(fault(0.4, 39), None);
+    let found = fault(0.4, 40).unwrap();
+    assert!(
+        found.starts_with("0.40 of the structure near 40 boxes is inside"),
+        "{found}"
+    );
+}
+
+#[test]
+fn objects_near_the_sensor_that_no_point_hits_count_as_boxes_without_points() {
+    let frame = Frame {
+        world_from_lidar: Some(protocol::Pose::IDENTITY),
+        missed_objects: 7,
+        ..Frame::empty(CavId::new("1").unwrap(), 0, protocol::Handedness::Right)
+    };
+    let findings = FrameFindings::of(Some(frame), Some(&PcdCloud::default()));
+    assert_eq!((findings.placed_boxes, findings.empty_boxes), (7, [7; 3]));
+    assert_eq!(findings.boxes_without_points, 0, "they are not listed");
 }
 
 /// Problem of a sweep of a street that is 8 m wide and 60 m long, between walls of 6 m, whose axes are in this order.
@@ -225,6 +310,7 @@ fn cars_that_do_not_have_the_form_of_cars_are_named() {
         (Car, [2.2, 1.5, 1.5]),
         (Car, [12.0, 2.6, 3.2]),
         (Car, [0.5, 0.6, 1.8]),
+        (Car, [5.9, 2.0, 2.7]),
         (Pedestrian, [1.3, 1.5, 1.8]),
         (Truck, [16.0, 3.4, 4.0]),
     ] {
@@ -236,6 +322,7 @@ fn cars_that_do_not_have_the_form_of_cars_are_named() {
             "scene: agent 1: 20 of 20 cars, first of 1.9 x 4.5 x 1.5 m, are shorter than wide or high",
         ),
         ([1.5, 1.7, 4.2], "shorter than wide or high"),
+        ([4.5, 1.5, 1.9], "higher than wide"),
         ([9.0, 3.9, 3.1], "larger than any car"),
     ] {
         let found = form_finding(Car, size_m).unwrap();

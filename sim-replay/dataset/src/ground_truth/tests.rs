@@ -145,6 +145,22 @@ fn objects_of_other_classes_are_ignored_at_any_distance() {
 }
 
 #[test]
+fn an_object_that_counts_for_one_agent_is_not_ignored_for_the_class_of_another() {
+    let rule = GroundTruthRule {
+        classes: "car".parse().unwrap(),
+        ..GroundTruthRule::OPV2V
+    };
+    let frames = [
+        frame("1", 0.0, vec![car(1, 10.0, 0.0), truck(2, 60.0)]),
+        frame("2", 5.0, vec![truck(1, 10.5), truck(3, 20.0)]),
+    ];
+    let truth = GroundTruth::of_tick(&frames.each_ref(), 0, &rule);
+    let ids = [&truth.objects, &truth.ignored]
+        .map(|boxes| boxes.iter().map(|object| object.id).collect::<Vec<_>>());
+    assert_eq!(ids, [vec![1], vec![2, 3]]);
+}
+
+#[test]
 fn heading_is_right_at_half_a_turn() {
     for yaw in [std::f64::consts::PI, -std::f64::consts::PI, 3.0, -3.0] {
         let object = Object {

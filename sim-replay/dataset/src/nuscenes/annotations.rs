@@ -18,6 +18,8 @@ use crate::{ReadError, Result, classes};
 const HIT_MARGIN_M: f64 = 0.2;
 /// Unknown categories that are reported one by one.
 const MAX_UNKNOWN: usize = 20;
+/// Distance from the LiDAR within which a sweep hits most objects, metres.
+const NEAR_M: f64 = 20.0;
 /// Highest mount of a LiDAR above the roof, metres. Roadside units are mounted higher.
 const MAX_MOUNT_M: f64 = 1.5;
 
@@ -92,8 +94,8 @@ fn object(row: &JsonField<'_>, instances: &HashMap<String, Instance>) -> Result<
     Ok(Object::new(id, class, pose, size_m))
 }
 
-/// The objects that a sweep hits with at least one point. An object with the LiDAR inside or on its roof is the vehicle
-/// that carries it: a vehicle does not list itself.
+/// The objects that a sweep hits with at least one point, and the number of the others near the LiDAR. An object with
+/// the LiDAR inside or on its roof is the vehicle that carries it: a vehicle does not list itself.
 #[expect(
     clippy::indexing_slicing,
     clippy::cast_possible_truncation,
@@ -103,17 +105,22 @@ pub(super) fn seen<'a>(
     objects: &'a [Object],
     points: &PointCloud,
     world_from_lidar: &Isometry3<f64>,
-) -> impl Iterator<Item = &'a Object> {
-    let (cells, world_from_lidar) = (PointCells::new(points), *world_from_lidar);
-    objects.iter().filter(move |object| {
+) -> (Vec<&'a Object>, usize) {
+    let (cells, mut missed) = (PointCells::new(points), 0);
+    let hit = objects.iter().filter(|object| {
         let world_from_object = object.world_from_object.isometry();
-        let object_from_lidar = world_from_object.inv_mul(&world_from_lidar);
+        let object_from_lidar = world_from_object.inv_mul(world_from_lidar);
         let lidar = object_from_lidar.translation.vector;
         let half_m = object.size_m.map(|size| size / 2.0);
         let roof_m = [0.0, 0.0, MAX_MOUNT_M];
         // The mount is added at both ends of z: the test is symmetric about the centre of the box.
         let carries_lidar = (0..3).all(|axis| lidar[axis].abs() <= half_m[axis] + roof_m[axis]);
         let reach_m = half_m.map(|half| (half + HIT_MARGIN_M) as f32);
-        !carries_lidar && cells.holds_point(&object_from_lidar.cast(), reach_m, [1.0; 2])
-    })
+        let object_from_lidar = object_from_lidar.cast();
+        let mut hits = cells.points_in(&object_from_lidar, reach_m, [1.0; 2]);
+        let is_hit = hits.next().is_some();
+        missed += usize::from(!carries_lidar && !is_hit && lidar.norm() < NEAR_M);
+        !carries_lidar && is_hit
+    });
+    (hit.collect(), missed)
 }

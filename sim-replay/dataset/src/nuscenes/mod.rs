@@ -376,8 +376,9 @@ impl FrameSource for SceneSource {
             let cloud = self.points(agent, tick, None)?;
             let (table, mut objects) = (self.version.join(ANNOTATIONS), moment.objects.clone());
             repeats::leave_out(&table, &mut objects, &mut frame.problems);
-            let seen = annotations::seen(&objects, &cloud.points, &world_from_lidar);
-            frame.objects = seen.map(|object| self.with_class(object)).collect();
+            let (seen, missed) = annotations::seen(&objects, &cloud.points, &world_from_lidar);
+            let seen = seen.into_iter().map(|object| self.with_class(object));
+            (frame.objects, frame.missed_objects) = (seen.collect(), missed);
         }
         Ok(frame)
     }

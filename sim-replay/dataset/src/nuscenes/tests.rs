@@ -817,3 +817,21 @@ proptest! {
         }
     }
 }
+
+#[test]
+fn objects_near_the_lidar_that_no_point_hits_are_counted() {
+    let place = |x: f64, y: f64| protocol::Pose::from_xyz_yaw([x, y, 0.0], 0.0);
+    // The LiDAR is on the last one.
+    let places = [
+        place(8.0, 0.0),
+        place(0.0, 9.0),
+        place(0.0, 30.0),
+        place(0.0, 0.0),
+    ];
+    let objects = places.map(|place| Object::new(0, ObjectClass::Car, place, [4.0, 2.0, 1.5]));
+    let points = protocol::PointCloud {
+        xyzi: vec![[8.0, 0.5, 0.0, 0.1]],
+    };
+    let (seen, missed) = annotations::seen(&objects, &points, &nalgebra::Isometry3::identity());
+    assert_eq!((seen, missed), (vec![&objects[0]], 1));
+}

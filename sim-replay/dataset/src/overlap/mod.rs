@@ -17,6 +17,12 @@ const CANDIDATES: usize = 24;
 /// Pairs of these whose sweeps are read, evenly spread; and those with the largest turn.
 const SPREAD: usize = 3;
 const TURNS: usize = 2;
+/// Sweeps after the first of a spread pair that are tried for one whose stated motion is nearest [`JUDGED_M`], metres:
+/// so far apart, a wrong scale or another drive differs by more than [`OTHER_M`]. It is used from half of that motion on,
+/// where the successive sweeps have less, and within the turns that are searched, radians.
+const LATER_STEPS: [usize; 7] = [2, 3, 4, 6, 9, 13, 19];
+const JUDGED_M: f64 = 4.0;
+const MOST_TURN_RAD: f64 = 0.15;
 /// Ticks from one sweep to the next where successive ones are less than [`MOVED_M`] apart.
 const SLOW_STEP: usize = 5;
 const MOVED_M: f64 = 0.5;
@@ -67,7 +73,7 @@ struct Contradiction {
     best: Match,
 }
 
-/// One problem for each agent of a scenario whose sweeps contradict its poses. Reads fifteen sweeps of each agent at most.
+/// One problem for each agent of a scenario whose sweeps contradict its poses. Reads 24 sweeps of each agent at most.
 /// Agents that stand, sweeps without structure and unreadable frames give none, nor do the independent frames of KITTI
 /// object.
 pub fn pose_problems(scenario: &Scenario) -> Vec<Problem> {
@@ -116,7 +122,7 @@ fn shown(motion: &Isometry3<f32>) -> String {
     format!("({x:.1}, {y:.1}, {z:.1}) m and a turn by {degrees:.1} degrees")
 }
 
-/// Pairs that are spread evenly, and those that turn most.
+/// Pairs that are spread evenly, near and farther apart, and those that turn most.
 fn pairs(scenario: &Scenario, agent: usize) -> Vec<SweepPair> {
     let ticks: Vec<usize> = (0..scenario.ticks.len())
         .filter(|&tick| scenario.is_present(agent, tick))
@@ -136,8 +142,36 @@ fn pairs(scenario: &Scenario, agent: usize) -> Vec<SweepPair> {
         let [a, b] = [a, b].map(|pair| pair.stated.rotation.angle());
         b.total_cmp(&a)
     });
-    chosen.extend(candidates.into_iter().take(TURNS));
+    let farther = chosen.clone();
+    let farther = farther
+        .iter()
+        .filter_map(|near| farther_pair(scenario, agent, &ticks, near));
+    chosen.extend(candidates.into_iter().take(TURNS).chain(farther));
     chosen
+}
+
+/// The first sweep of a pair and a later one, if the poses are farther apart there.
+fn farther_pair(
+    scenario: &Scenario,
+    agent: usize,
+    ticks: &[usize],
+    near: &SweepPair,
+) -> Option<SweepPair> {
+    let moved_m = |pair: &SweepPair| pair.stated.translation.vector.norm();
+    let from_best = |pair: &SweepPair| (moved_m(pair) - JUDGED_M).abs();
+    let start = near.ticks[0];
+    // A fast drive is judged by successive sweeps.
+    let place = ticks
+        .binary_search(&start)
+        .ok()
+        .filter(|_| moved_m(near) < JUDGED_M / 2.0)?;
+    let later = LATER_STEPS
+        .iter()
+        .filter_map(|step| ticks.get(place + step));
+    let pairs = later.filter_map(|later| pair_of(scenario, agent, [start, *later]));
+    let pairs = pairs.filter(|pair| pair.stated.rotation.angle() < MOST_TURN_RAD);
+    let best = pairs.min_by(|a, b| from_best(a).total_cmp(&from_best(b)));
+    best.filter(|best| moved_m(best) >= JUDGED_M / 2.0)
 }
 
 /// A sweep and its successor, or a later one where that is close.

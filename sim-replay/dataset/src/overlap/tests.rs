@@ -132,6 +132,19 @@ fn sound_poses_have_no_problem() {
 }
 
 #[test]
+fn a_wrong_scale_is_found_where_successive_sweeps_are_near() {
+    // 6 m/s, to the side: walls lie across.
+    let poses: Vec<Isometry3<f64>> = (0..40)
+        .map(|frame| Isometry3::translation(5.0, 0.6 * f64::from(frame) - 12.0, 1.8))
+        .collect();
+    assert_eq!(problems(&poses, &poses), Vec::<String>::new());
+    let longer = moved(&poses, |pose| {
+        Isometry3::from_parts((pose.translation.vector * 1.3).into(), pose.rotation)
+    });
+    assert_eq!(problems(&poses, &longer).len(), 1);
+}
+
+#[test]
 fn dense_traffic_that_drives_along_is_no_problem_of_the_poses() {
     let poses = drive();
     assert_eq!(problems_among(16, &poses, &poses), Vec::<String>::new());

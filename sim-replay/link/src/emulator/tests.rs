@@ -122,6 +122,49 @@ fn small_messages_do_not_wait_and_cost_their_time() {
 }
 
 #[test]
+fn small_messages_queue_behind_each_other_within_the_same_limits() {
+    let limited = |bytes, keep_last| LinkConfig {
+        queue: QueueConfig {
+            bytes,
+            keep_last,
+            ..QueueConfig::default()
+        },
+        ..shaped(8.0)
+    };
+    let dropped = Delivery::Dropped(DropReason::LinkQueue);
+    // The smaller one is not overtaken by the larger one, although both are urgent.
+    let both = [packet("a", 0, 200, 0), packet("a", 1, 1_200, 0)];
+    let outcomes = all(&limited(9_000, false), both);
+    let times: Vec<_> = outcomes.iter().map(|it| it.nanos / 1_000).collect();
+    assert_eq!(times, [200, 1_400]);
+    let three = [0, 1, 2].map(|k| packet("a", k, 1_000, 0));
+    assert_eq!(
+        times_ms(&all(&limited(1_500, false), three.clone())),
+        [(2, 0, dropped), (0, 1, ARRIVED), (1, 2, ARRIVED)]
+    );
+    assert_eq!(
+        times_ms(&all(&limited(9_000, true), three)),
+        [(1, 0, dropped), (0, 1, ARRIVED), (2, 2, ARRIVED)]
+    );
+}
+
+#[test]
+fn the_burst_is_available_from_the_beginning() {
+    let config = LinkConfig {
+        capacity: CapacityConfig::TokenBucket {
+            bandwidth_mbps: 8.0,
+            burst_bytes: 20_000,
+        },
+        ..LinkConfig::default()
+    };
+    let packets = [packet("a", 0, 20_000, 0), packet("a", 1, 5_000, 0)];
+    assert_eq!(
+        times_ms(&all(&config, packets)),
+        [(0, 0, ARRIVED), (1, 5, ARRIVED)]
+    );
+}
+
+#[test]
 fn a_full_queue_drops_the_newcomer_or_the_oldest() {
     let packets = [0, 1, 2, 3].map(|k| packet("a", k, 20_000, k * MS));
     let dropped = Delivery::Dropped(DropReason::LinkQueue);
@@ -161,10 +204,9 @@ fn a_full_queue_drops_the_newcomer_or_the_oldest() {
         },
         ..shaped(8.0)
     };
-    let superseded = Delivery::Dropped(DropReason::Superseded);
     let expected = [
-        (1, 2, superseded),
-        (2, 3, superseded),
+        (1, 2, dropped),
+        (2, 3, dropped),
         (0, 20, ARRIVED),
         (3, 40, ARRIVED),
     ];

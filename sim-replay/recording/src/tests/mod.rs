@@ -322,6 +322,26 @@ fn a_recovered_recording_has_an_index_and_the_same_messages() {
 }
 
 #[test]
+fn a_file_that_is_not_written_as_a_whole_leaves_nothing() {
+    let folder = tempfile::tempdir().unwrap();
+    let to = folder.path().join("whole.mcap");
+    let options = RecordingOptions::default();
+    let failed = RecordingWriter::whole(&to, options, |writer| {
+        for (key, payload) in tick_messages(0, 10) {
+            writer.write(&key, 1, &payload)?;
+        }
+        writer.flush()?;
+        assert!(!to.exists(), "it has no name yet");
+        Err::<(), _>(RecordingError::not_ours(&to, "the disk is full"))
+    });
+    failed.unwrap_err();
+    assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0);
+    RecordingWriter::whole(&to, options, RecordingWriter::finish).unwrap();
+    let error = RecordingWriter::whole(&to, options, RecordingWriter::finish).unwrap_err();
+    assert!(error.to_string().contains("whole.mcap: "), "{error}");
+}
+
+#[test]
 fn json_stands_beside_our_own_messages() {
     let disk = Disk::new(usize::MAX);
     let mut writer =
@@ -401,7 +421,9 @@ fn the_first_of_two_replays_of_one_tick_is_used_with_its_own_truth() {
     let mut dataset = dataset::open(&write(folder.path(), &disk.bytes())).unwrap();
     assert_eq!(dataset.problems.len(), 1, "{:?}", dataset.problems);
     assert!(
-        dataset.problems[0].to_string().contains("1 ticks"),
+        dataset.problems[0]
+            .to_string()
+            .contains("second replay: the message is"),
         "{}",
         dataset.problems[0]
     );
@@ -411,6 +433,154 @@ fn the_first_of_two_replays_of_one_tick_is_used_with_its_own_truth() {
         .load(0, 0, &LoadOptions::default())
         .unwrap();
     assert_eq!(frame.objects.len(), 1);
+}
+
+/// A recording of some messages in a folder, opened as a data set.
+fn opened(
+    folder: &tempfile::TempDir,
+    messages: impl IntoIterator<Item = (Key, Vec<u8>)>,
+) -> dataset::Dataset {
+    let disk = Disk::new(usize::MAX);
+    let mut writer =
+        RecordingWriter::over(disk.clone(), Path::new("t"), RecordingOptions::default()).unwrap();
+    for (key, payload) in messages {
+        writer.write(&key, 5, &payload).unwrap();
+    }
+    writer.finish().unwrap();
+    dataset::open(&write(folder.path(), &disk.bytes())).unwrap()
+}
+
+fn lidar_key(cav: &str) -> Key {
+    let cav = CavId::new(cav).unwrap();
+    Key::stream(&RunId::new("test").unwrap(), &cav, Stream::Lidar)
+}
+
+/// A sweep of another vehicle, epoch or time than usual.
+fn sweep(stamp: &Stamp) -> Vec<u8> {
+    let points = cloud(9, 1);
+    wire::encode(stamp, Lidar { points }).unwrap().to_vec()
+}
+
+#[test]
+fn a_tick_without_its_truth_has_no_true_pose_and_a_recording_without_any_that_of_its_receivers() {
+    let folder = tempfile::tempdir().unwrap();
+    let messages = || (0..2).flat_map(|tick| tick_messages(tick, 1));
+    let pose_of_first = |messages: Vec<(Key, Vec<u8>)>| {
+        let scenario = opened(&folder, messages).scenarios.remove(0);
+        let frame = scenario.load(0, 0, &LoadOptions::default()).unwrap();
+        frame.world_from_lidar
+    };
+    let is_truth = |key: &Key| key.topic == protocol::Topic::Truth;
+    let mut without_first: Vec<_> = messages().collect();
+    let first = without_first.iter().position(|(key, _)| is_truth(key));
+    without_first.remove(first.unwrap());
+    assert_eq!(pose_of_first(without_first), None);
+    let without_any = messages().filter(|(key, _)| !is_truth(key));
+    assert_eq!(pose_of_first(without_any.collect()), Some(pose(0)));
+}
+
+#[test]
+fn a_sweep_on_the_topic_of_another_vehicle_is_left_out_and_named() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut messages = tick_messages(0, 1);
+    messages.insert(0, (lidar_key(AGENTS[0]), sweep(&stamp(AGENTS[1], 0))));
+    let mut dataset = opened(&folder, messages);
+    assert!(
+        dataset.problems[0].to_string().ends_with(
+            "v2v/test/4279/lidar at 100000000 ns: its header names 4288: the message is left out"
+        ),
+        "{:?}",
+        dataset.problems
+    );
+    let scenario = dataset.scenarios.remove(0);
+    let frame = scenario.load(0, 0, &LoadOptions::default()).unwrap();
+    assert_eq!(frame.points, cloud(0, 1));
+}
+
+#[test]
+fn a_second_sender_of_a_sweep_is_counted_and_a_repeated_message_is_not() {
+    let folder = tempfile::tempdir().unwrap();
+    let second = Stamp {
+        epoch: 2,
+        ..stamp(AGENTS[0], 0)
+    };
+    for (again, problems) in [(stamp(AGENTS[0], 0), 0), (second, 1)] {
+        let mut messages = tick_messages(0, 1);
+        messages.push((lidar_key(AGENTS[0]), sweep(&again)));
+        let found = opened(&folder, messages).problems;
+        assert_eq!(found.len(), problems, "{found:?}");
+        let expected = "published by a second replay: the message is left out";
+        assert!(found.iter().all(|it| it.to_string().ends_with(expected)));
+    }
+}
+
+#[test]
+fn sweeps_between_the_ticks_are_named_and_those_of_a_late_or_lossy_vehicle_are_not() {
+    let folder = tempfile::tempdir().unwrap();
+    let of_second = |key: &Key| *key == lidar_key(AGENTS[1]);
+    let problems = |moved_nanos: u64, kept: &dyn Fn(&Key, u64) -> bool| {
+        let messages = (0..6).flat_map(|tick| {
+            let messages = tick_messages(tick, 1).into_iter();
+            let messages = messages.filter(move |(key, _)| kept(key, tick));
+            messages.map(move |(key, payload)| {
+                let usual = stamp(AGENTS[1], tick);
+                let moved = Stamp {
+                    capture_nanos: usual.capture_nanos + moved_nanos,
+                    ..usual
+                };
+                let payload = if of_second(&key) {
+                    sweep(&moved)
+                } else {
+                    payload
+                };
+                (key, payload)
+            })
+        });
+        let problems = opened(&folder, messages).problems;
+        problems.iter().map(ToString::to_string).collect::<Vec<_>>()
+    };
+    let named = problems(10_000_000, &|_, _| true);
+    assert!(
+        named[0].ends_with(
+            "4288 has sweeps 10 ms and more off every sweep of 4279: it takes part in no tick"
+        ),
+        "{named:?}"
+    );
+    let nothing: [&str; 0] = [];
+    assert_eq!(problems(0, &|_, _| true), nothing);
+    assert_eq!(
+        problems(0, &|key, tick| of_second(key) || !(1..5).contains(&tick)),
+        nothing,
+        "the ego is away in between"
+    );
+    let either =
+        |key: &Key, tick: u64| of_second(key) != (*key == lidar_key(AGENTS[0]) && tick < 4);
+    assert_eq!(problems(0, &either), nothing);
+}
+
+#[test]
+fn topics_that_are_no_keys_are_named_where_nothing_else_is_recorded() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("recording.mcap");
+    let mut writer = mcap::Writer::new(std::fs::File::create(&file).unwrap()).unwrap();
+    let none = std::collections::BTreeMap::new();
+    let topic = "v2v/R1/4279/lidar";
+    let channel = writer.add_channel(0, topic, OWN_ENCODING, &none).unwrap();
+    let header = mcap::records::MessageHeader {
+        channel_id: channel,
+        sequence: 0,
+        log_time: 5,
+        publish_time: 5,
+    };
+    let payload = sweep(&stamp("4279", 0));
+    writer.write_to_known_channel(&header, &payload).unwrap();
+    writer.finish().unwrap();
+    drop(writer);
+    let error = Recording::open(&file).unwrap_err().to_string();
+    assert!(
+        error.contains("run name \"R1\" is not an identifier"),
+        "{error}"
+    );
 }
 
 #[test]

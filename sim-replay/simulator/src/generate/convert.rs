@@ -14,6 +14,7 @@ use super::layout::{
     locked,
 };
 use super::scenes::{begin_folder, end_folder};
+use dataset::frame::ObjectClass;
 use dataset::{Dataset, LeftOut, LoadOptions, LoadedTick, Problem, ReadError, Scenario};
 
 /// Candidate lengths of a tick, nanoseconds: the step of a simulator, and resolutions of sensor clocks.
@@ -24,7 +25,7 @@ const TICKS_NANOS: [u64; 4] = [50_000_000, 10_000_000, 1_000_000, 1_000];
 pub struct Converted {
     /// Scenarios.
     pub scenarios: usize,
-    /// Frames of all agents together.
+    /// Frames that were written, of all agents together.
     pub agent_frames: usize,
     /// Data that the layout cannot hold, with the number of times that it was left out.
     pub omitted: BTreeMap<&'static str, u64>,
@@ -55,9 +56,8 @@ pub fn convert(
     let done = AtomicUsize::new(0);
     for scenario in &dataset.scenarios {
         writer.begin(&header(scenario, dataset)?)?;
-        let holds_images = layout == SceneLayout::Opv2v;
         let losses = (&omitted, &left_out);
-        let frames = write_moments(scenario, writer.as_ref(), holds_images, losses, &|| {
+        let frames = write_moments(scenario, writer.as_ref(), layout, losses, &|| {
             progress(done.fetch_add(1, Ordering::Relaxed) + 1, total)
         })?;
         writer.end()?;
@@ -103,7 +103,7 @@ fn header(scenario: &Scenario, dataset: &Dataset) -> Result<SceneHeader, SynthEr
 fn write_moments(
     scenario: &Scenario,
     writer: &dyn SceneWriter,
-    holds_images: bool,
+    layout: SceneLayout,
     (omitted, left_out): (&Omissions, &Mutex<LeftOut>),
     done: &(dyn Fn() + Sync),
 ) -> Result<usize, SynthError> {
@@ -127,15 +127,36 @@ fn write_moments(
             index,
             frames: frames.collect(),
         };
-        if !holds_images {
-            let images = moment.frames.iter().map(|agent| agent.frame.cameras.len());
-            let what = "camera images, which the layout does not have";
-            omitted.add(what, images.sum());
+        for agent in &moment.frames {
+            count_losses(agent, layout, omitted);
         }
-        writer.write(&moment, omitted)?;
-        Ok(moment.frames.len())
+        writer.write(&moment, omitted)
     });
     moments.sum()
+}
+
+/// Counts the data of a frame that a layout does not hold, beside those that its writer counts.
+fn count_losses(agent: &AgentFrame, layout: SceneLayout, omitted: &Omissions) {
+    use SceneLayout::{KittiObject, Mars, Opv2v, V2v4real, V2xreal, V2xsim};
+    let (frame, copies, is_opv2v) = (&agent.frame, agent.variants.len(), layout == Opv2v);
+    let speeds = frame.objects.iter().map(|object| object.speed_mps);
+    let speeds = speeds.chain([frame.speed_mps]).flatten().count();
+    let vans = (frame.objects.iter()).filter(|object| object.class == ObjectClass::Van);
+    let gnss = frame.gnss_world_from_vehicle.iter().len();
+    let has_speeds = matches!(layout, Opv2v | V2v4real | V2xreal);
+    let has_vans = !matches!(layout, V2xsim | Mars);
+    for (what, count, is_held) in [
+        ("poses", 1, layout != KittiObject),
+        ("camera images", frame.cameras.len(), is_opv2v),
+        ("radar sweeps", frame.radar.iter().len(), is_opv2v),
+        ("copies in other weather", copies, is_opv2v),
+        ("yaw rates", frame.yaw_rate_rad_s.iter().len(), is_opv2v),
+        ("poses by GNSS", gnss, is_opv2v),
+        ("speeds", speeds, has_speeds),
+        ("vans, which are cars there", vans.count(), has_vans),
+    ] {
+        omitted.add(what, if is_held { 0 } else { count });
+    }
 }
 
 /// The frames of a capture time. No layout can hold sweeps without a pose.

@@ -6,10 +6,11 @@ use super::raycast::{Course, Placement};
 use super::traffic::{Rectangle, STEP_S, Traffic, TrafficOptions};
 use super::vehicle::Vehicle;
 use super::world::World;
+use dataset::ground_truth::GroundTruthRule;
 use support::random::{SplitMix64, derive_seed};
 
 /// Communication range: agents farther than this from the ego are not received, metres.
-const COMM_RANGE_M: f64 = 70.0;
+const COMM_RANGE_M: f64 = GroundTruthRule::OPV2V.comm_range_m;
 /// Companions are chosen within this, so that few frames fall out of range, metres.
 const COMPANION_RANGE_M: f64 = 62.0;
 /// Share of frames that a companion should be in range.

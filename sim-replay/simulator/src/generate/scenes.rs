@@ -204,7 +204,7 @@ impl SynthScene<'_, '_> {
                     return;
                 }
                 let moment = self.moment(recording, agents, index, &mut bench);
-                let result = writer.write(&moment, omitted).map(|()| counts(&moment));
+                let result = writer.write(&moment, omitted).map(|_| counts(&moment));
                 let mut total = locked(&total);
                 match (&mut *total, result) {
                     (Ok(total), Ok(summary)) => total.add(&summary),

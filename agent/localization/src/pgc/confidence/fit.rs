@@ -2,6 +2,7 @@
 
 use nalgebra::{SMatrix, SVector};
 use serde::Serialize;
+use support::statistics::SUCCESS_M;
 
 use super::isotonic::MonotoneMap;
 use super::{ConfidenceModel, FEATURES, features};
@@ -9,7 +10,7 @@ use crate::pgc::pose_evidence::PoseEvidence;
 use crate::statistics::share_limit;
 
 /// Error above which a pose is bad, metres: the paper's limit of success.
-pub const BAD_M: f64 = 3.0;
+pub const BAD_M: f64 = SUCCESS_M;
 
 /// Fewest sweeps to fit on.
 const MIN_SWEEPS: usize = 40;

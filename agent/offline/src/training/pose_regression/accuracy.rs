@@ -4,6 +4,7 @@ use std::fmt;
 
 use localization::baselines::{PoseRegressor, RegressPose};
 use serde::Serialize;
+use support::statistics::SUCCESS_M;
 use tch::{Kind, TchError, Tensor, no_grad};
 
 use super::token_cache::TokenSweeps;
@@ -43,7 +44,7 @@ pub(super) fn accuracy<N: RegressPose>(
     let squares = off.f_narrow(1, 0, 3)?.f_square()?;
     let error = squares.f_sum_dim_intlist(1_i64, false, Kind::Float)?;
     let error = error.f_sqrt()?;
-    let is_success = error.f_lt(3.0)?.f_to_kind(Kind::Float)?;
+    let is_success = error.f_lt(SUCCESS_M)?.f_to_kind(Kind::Float)?;
     Ok(RegressionAccuracy {
         p50_m: error.f_median()?.f_double_value(&[])?,
         success_3m: is_success.f_mean(Kind::Float)?.f_double_value(&[])?,

@@ -6,7 +6,7 @@ use agent::rate::RateConfig;
 use anyhow::{Context, Result};
 use ego_fuser_offline::evaluation::AgentPool;
 use fusion::{Exchange, Method};
-use link::{CapacityConfig, LatencyModel, LinkConfig, LossModel};
+use link::{CapacityConfig, LatencyModel, LinkConfig, LossModel, LossUnit};
 use localization::pose_source::{NoisyPoseConfig, PoseSourceConfig};
 use perception::model_config::DetectorConfig;
 use perception::weights::Weights;
@@ -177,7 +177,8 @@ impl Point {
             link.capacity = CapacityConfig::of_mbps(bandwidth_mbps);
         }
         if let Some(share) = self.loss {
-            link.loss = LossModel::Bernoulli(share);
+            // The axis is the fraction of the messages, whatever the link's own unit.
+            (link.loss, link.loss_unit) = (LossModel::Bernoulli(share), LossUnit::Message);
         }
     }
 
@@ -294,7 +295,10 @@ mod tests {
     }
 
     fn shaped_link(point: &Point) -> LinkConfig {
-        let mut link = LinkConfig::default();
+        let mut link = LinkConfig {
+            loss_unit: LossUnit::Fragment,
+            ..LinkConfig::default()
+        };
         point.shape(&mut link);
         link
     }
@@ -324,7 +328,10 @@ mod tests {
                 burst_bytes: 0
             }
         );
-        assert_eq!(last.loss, LossModel::Bernoulli(0.1));
+        assert_eq!(
+            (last.loss, last.loss_unit),
+            (LossModel::Bernoulli(0.1), LossUnit::Message)
+        );
     }
 
     #[test]

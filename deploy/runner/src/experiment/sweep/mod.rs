@@ -167,13 +167,15 @@ impl ExperimentSweep {
         self.data.frame_count(self.experiment.scenarios)
     }
 
-    /// Computes the missing runs of a slice. Feature maps stay for the other slices.
+    /// Computes the missing runs of a slice; returns all of it. Feature maps stay for the other slices.
     ///
     /// # Errors
     /// As [`Self::run`].
-    pub fn run_slice(&self, slice: Slice, jobs: usize) -> Result<()> {
+    pub fn run_slice(&self, slice: Slice, jobs: usize) -> Result<Vec<Cell>> {
         let keys = self.keys()?;
-        self.compute_missing(&keys, slice.part(keys.len()), jobs)
+        let part = slice.part(keys.len());
+        self.compute_missing(&keys, part.clone(), jobs)?;
+        Ok(self.known(&keys[part])?.into_iter().flatten().collect())
     }
 
     /// Computes the missing runs and writes table, charts and report. Returns the columns that vary between the runs, as
@@ -262,10 +264,7 @@ impl ExperimentSweep {
             let bar = progress::bar(0, "sweeps encoded");
             let kept = self.experiment.kept_maps(&self.maps());
             let (scenarios, digests) = (&self.data.scenarios, &self.data.digests);
-            let on_sweep = &mut |done, all| {
-                bar.set_length(all as u64);
-                bar.set_position(done as u64);
-            };
+            let on_sweep = &mut progress::shown_on(&bar);
             FeatureStore::open(&kept, &weights, scenarios, digests, jobs, on_sweep)?;
             bar.finish_and_clear();
         }

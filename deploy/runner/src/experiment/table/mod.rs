@@ -9,10 +9,14 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, anyhow, bail};
+use perception::model_config::DetectorConfig;
+use perception::weights::Weights;
+use protocol::Dtype;
 use support::atomic_file;
 use support::cli::NotWritten;
 use support::file_digests::FileDigests;
 use support::output;
+use support::sampling::repeated;
 
 pub use text::{csv, markdown};
 
@@ -28,6 +32,8 @@ use crate::scenario::weights_choice::weights_of;
 pub struct FilledTable {
     /// Name of its files.
     pub name: String,
+    /// Number format of transmitted feature values.
+    pub dtype: Dtype,
     /// Conditions.
     pub columns: Vec<Column>,
     /// Its rows, each with its cells: column by column, training by training.
@@ -51,7 +57,9 @@ pub fn run(
     atomic_file::create_folder(&cells).with_context(|| NotWritten(cells.clone()))?;
     generate(experiment)?;
     let data = OpenedData::open(&experiment.trial()?)?;
-    let lacking = data.lacking(experiment.scenarios, experiment.frames);
+    let of_tables = experiment.tables.iter().filter_map(|table| table.scenarios);
+    let most = of_tables.chain(experiment.scenarios).max();
+    let lacking = data.lacking(most, experiment.frames);
     lacking.into_iter().for_each(output::note);
     let run = TableRun {
         experiment,
@@ -76,22 +84,60 @@ pub fn run(
             let path = out.join(format!("{}.{ending}", table.name));
             atomic_file::write(&path, text).with_context(|| path.display().to_string())?;
         }
+        let result = |cell: &Cell| [cell.metrics.ap_global, cell.metrics.ap_frame_order];
+        let rows = table.rows.iter();
+        let same = rows.filter_map(|(row, columns)| same_results(row, columns, result));
+        same.for_each(|same| output::note(format_args!("table {:?}, {same}", table.name)));
         filled.push(table);
     }
     Ok(filled)
 }
 
-/// Refuses trainings of a row that are one, by another path or as a copy: their standard deviation would be 0.
+/// Refuses trainings of a row that are one, by another path or as a copy: their standard deviation would be 0; and
+/// trainings of different networks, of which there is no mean.
 fn check_trainings(row: &Row, digests: &FileDigests) -> Result<()> {
     let mut known = BTreeMap::new();
+    let mut first: Option<(DetectorConfig, &PathBuf)> = None;
     for weights in &row.weights {
         let file = weights_of(weights, row.method, row.boxes.is_some())?;
+        // A file that cannot be read is refused where it is used.
+        if let Ok(config) = Weights::load(&file).and_then(|file| file.detector_config()) {
+            let (network, same) = first.get_or_insert((config.clone(), weights));
+            // Names are for reports only.
+            network.name.clone_from(&config.name);
+            if *network != config {
+                let (row, [same, other]) = (row.label(), [*same, weights].map(|it| it.display()));
+                bail!("row {row}: weights {same} and {other} are of different networks");
+            }
+        }
         if let Some(same) = known.insert(digests.of(&file)?, weights) {
             let (row, [same, other]) = (row.label(), [same, weights].map(|file| file.display()));
             bail!("row {row}: weights {same} and {other} have the same contents");
         }
     }
     Ok(())
+}
+
+/// Sentence about two trainings of a row with the same results in all columns: they differ in what the row does not use,
+/// and are no two samples for a standard deviation.
+fn same_results<C, R: PartialEq>(
+    row: &Row,
+    columns: &[Vec<C>],
+    result: impl Fn(&C) -> R,
+) -> Option<String> {
+    let of = |training: usize| -> Vec<Option<R>> {
+        let cells = columns.iter().map(|cells| cells.get(training));
+        cells.map(|cell| cell.map(&result)).collect()
+    };
+    let trainings: Vec<_> = (0..row.weights.len()).map(of).collect();
+    let twice = repeated(&trainings)?;
+    let results = row.weights.iter().zip(&trainings);
+    let mut same = results.filter(|(_, one)| *one == twice);
+    let [(first, _), (second, _)] = [same.next()?, same.next()?];
+    let (first, second, row) = (first.display(), second.display(), row.label());
+    Some(format!(
+        "row {row}: weights {first} and {second} have the same average precision in every column"
+    ))
 }
 
 struct TableRun<'a> {
@@ -155,6 +201,7 @@ impl TableRun<'_> {
         }
         Ok(FilledTable {
             name: table.name.clone(),
+            dtype: self.experiment.dtype,
             columns: table.columns.clone(),
             rows,
         })
@@ -203,6 +250,21 @@ mod tests {
     use super::*;
 
     #[test]
+    fn trainings_with_the_same_results_are_named() {
+        let row = Row {
+            weights: ["a", "b", "c"].map(PathBuf::from).to_vec(),
+            ..serde_saphyr::from_str("method: max").unwrap()
+        };
+        let same = "row max: weights a and c have the same average precision in every column";
+        let named = |second: [f64; 3]| {
+            let columns = [vec![0.5, 0.6, 0.5], second.to_vec()];
+            same_results(&row, &columns, |one| *one)
+        };
+        assert_eq!(named([0.7, 0.7, 0.7]).as_deref(), Some(same));
+        assert_eq!(named([0.7, 0.7, 0.8]), None);
+    }
+
+    #[test]
     fn a_training_that_is_named_twice_is_refused_by_whatever_path() {
         let folder = tempfile::tempdir().unwrap();
         for (name, contents) in [("a", "first"), ("b", "second"), ("copy", "first")] {
@@ -217,6 +279,15 @@ mod tests {
             checked.map_or(String::new(), |problem| problem.to_string())
         };
         assert_eq!(problem(&["a", "b"]), "");
+        let released = |name| format!("{}/../weights/{name}", env!("CARGO_MANIFEST_DIR"));
+        let others = ["lean-max.safetensors", "half.safetensors"].map(released);
+        let networks = problem(&[&others[0], &others[1]]);
+        assert!(
+            networks.ends_with("half.safetensors are of different networks"),
+            "{networks}"
+        );
+        let same = ["lean-max.safetensors", "lean-max-boxes.safetensors"].map(released);
+        assert_eq!(problem(&[&same[0], &same[1]]), "");
         for other in ["./a", "copy"] {
             let problem = problem(&["a", "b", other]);
             assert!(problem.contains("row max: weights ") && problem.contains("same contents"));

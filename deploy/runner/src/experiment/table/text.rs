@@ -52,12 +52,13 @@ fn cells_of(table: &FilledTable) -> impl Iterator<Item = &Cell> {
     rows.flat_map(|(_, cells)| cells.iter().flatten())
 }
 
-/// Provenance of the values: frames, programs, data, and every other file.
+/// Provenance of the values: frames, number format, programs, data, and every other file.
 fn provenance(table: &FilledTable) -> String {
     let frames = cells_of(table).map(|cell| cell.metrics.frames.to_string());
     let frames: BTreeSet<String> = frames.collect();
+    let dtype = format!("{:?}", table.dtype).to_lowercase();
     let mut text = format!(
-        "\nFrames: {}. Made of:\n\n",
+        "\nFrames: {}. Feature values are sent as {dtype}. Made of:\n\n",
         Vec::from_iter(frames).join(", ")
     );
     for line in sources(cells_of(table)) {
@@ -153,6 +154,7 @@ mod tests {
     use crate::experiment::spec::{Column, Row};
     use dataset::evaluation_protocol::EvaluationProtocol;
     use deploy::score::metrics::{ByIou, Communication, Metrics};
+    use protocol::Dtype;
     use support::provenance::Provenance;
 
     fn cell(method: Method, at_50: f64) -> Cell {
@@ -225,6 +227,7 @@ mod tests {
     fn table(columns: &[&str]) -> FilledTable {
         FilledTable {
             name: "main".into(),
+            dtype: Dtype::F16,
             columns: columns.iter().map(|name| column(name)).collect(),
             rows: vec![
                 filled_row(Method::NONE, &[0.5], columns.len()),

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::fmt::Write as _;
 
 use serde::Serialize;
-use support::statistics::{mean, median};
+use support::statistics::{SUCCESS_M, mean, median, share_below};
 
 use super::{PairError, PairOutcome};
 
@@ -19,8 +19,8 @@ pub struct MethodRow {
     pub time_s: f64,
     /// Mean bytes that a neighbour sends for it.
     pub bytes_mean: f64,
-    /// Their logarithm to base 2.
-    pub log2_bytes: f64,
+    /// Their logarithm to base 2; `None` where nothing was sent.
+    pub log2_bytes: Option<f64>,
     /// Share of all pairs that are right to 3 m, 0..1; a pair without alignment is not.
     pub success_3m: f64,
     /// The same within 1 m.
@@ -64,20 +64,17 @@ impl PairTally {
         let failed: usize = self.reasons.values().sum();
         let pairs = failed + self.errors.len();
         let divisor = pairs.max(1) as f64;
-        let [success_3m, success_1m] = [3.0, 1.0].map(|limit_m| {
-            let right = self.errors.iter().filter(|error| error.metres < limit_m);
-            right.count() as f64 / divisor
-        });
         let bytes_mean = self.bytes / divisor;
         let metres: Vec<f64> = self.errors.iter().map(|error| error.metres).collect();
+        let [success_3m, success_1m] =
+            [SUCCESS_M, 1.0].map(|limit_m| share_below(&metres, limit_m, pairs));
         let degrees: Vec<f64> = self.errors.iter().map(|error| error.degrees).collect();
         MethodRow {
             method: method.to_owned(),
             pairs,
             time_s: self.seconds / divisor,
             bytes_mean,
-            // Nothing sent gives 0 instead of minus infinity.
-            log2_bytes: bytes_mean.max(1.0).log2(),
+            log2_bytes: (bytes_mean > 0.0).then(|| bytes_mean.log2()),
             success_3m,
             success_1m,
             mean_m: mean(&metres),
@@ -102,13 +99,13 @@ pub fn markdown(rows: &[MethodRow]) -> String {
             (Some(mean), Some(median)) => format!("{mean:.2} / {median:.2}"),
             _ => "-".to_owned(),
         });
+        let bits = (row.log2_bytes).map_or_else(|| "-".to_owned(), |bits| format!("{bits:.2}"));
         // Writing to a string does not fail.
         let _ = writeln!(
             text,
-            "| {} | {:.4} | {:.2} | {:.2} | {:.2} | {metres} | {degrees} | {:.2} | {} |",
+            "| {} | {:.4} | {bits} | {:.2} | {:.2} | {metres} | {degrees} | {:.2} | {} |",
             row.method,
             row.time_s,
-            row.log2_bytes,
             100.0 * row.success_3m,
             100.0 * row.success_1m,
             100.0 * row.not_aligned,
@@ -153,7 +150,7 @@ mod tests {
         );
         assert_eq!(
             (row.p50_m, row.p50_deg, row.log2_bytes),
-            (Some(2.0), Some(1.0), 6.0)
+            (Some(2.0), Some(1.0), Some(6.0))
         );
         assert!(
             (row.mean_m.unwrap() - 32.5 / 3.0).abs() < 1e-12 && (row.time_s - 0.02).abs() < 1e-12
@@ -166,7 +163,7 @@ mod tests {
             "{text}"
         );
         assert!(
-            text.contains("| nothing | 0.0000 | 0.00 | 0.00 | 0.00 | - | - |"),
+            text.contains("| nothing | 0.0000 | - | 0.00 | 0.00 | - | - |"),
             "{text}"
         );
     }

@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use dataset::{LoadOptions, Scenario};
+use dataset::{LoadOptions, Scenario, period_nanos};
 use ego_fuser::ego::View;
 use protocol::config::{FieldError, within};
 use protocol::{EgoMotion, StageTiming};
@@ -24,7 +24,7 @@ const ESTIMATED_TICKS: usize = 5;
 const MOST_ESTIMATED_TICKS: usize = 50;
 
 /// Compute time of each step, milliseconds: the same for all vehicles and ticks. Every sweep is computed, so an agent
-/// (`pose_ms` + `map_ms`) and the ego (`fuse_ms`) take at most the shortest time between two sweeps.
+/// (`pose_ms` + `map_ms`) and the ego (`fuse_ms`) take at most the period of the scene.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ComputeTimes {
@@ -54,10 +54,7 @@ impl ComputeTimes {
 
     /// In simulation time every sweep is processed: a process that is slower than the scene is rejected.
     pub(super) fn check(&self, scenario: &Scenario) -> Result<(), EvaluateError> {
-        // Time that goes backwards gives a period of 0 rather than an overflow.
-        let steps = scenario.ticks.windows(2);
-        let steps = steps.map(|pair| pair[1].capture_nanos.saturating_sub(pair[0].capture_nanos));
-        let Some(period_nanos) = steps.min() else {
+        let Some(period_nanos) = period_nanos(&scenario.ticks) else {
             return Ok(());
         };
         let steps = [

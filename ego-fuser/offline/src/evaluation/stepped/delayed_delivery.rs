@@ -163,14 +163,8 @@ impl DelayedDelivery {
                 self.ledger.dropped(&account, reason);
                 return None;
             }
-            Delivery::Arrived {
-                is_repeated: true, ..
-            } => {
-                // The copy counts as one more message.
-                self.ledger.sent(&account);
-                let kept = self.kept.get(&packet.id);
-                kept.and_then(|(_, envelope)| envelope.clone())
-            }
+            // The receiver has the message already, and refuses its copy: neither sent nor lost.
+            Delivery::Arrived { is_copy: true, .. } => return None,
             Delivery::Arrived { .. } => self.kept.remove(&packet.id).and_then(|kept| kept.1),
         };
         let Some(mut envelope) = envelope else {
@@ -264,6 +258,22 @@ mod tests {
             ("3", boxes, 0),
         ];
         assert_eq!(numbers, expected);
+    }
+
+    #[test]
+    fn a_copy_made_by_the_link_is_neither_sent_nor_lost() {
+        let mut delivery = delivery();
+        let config = LinkConfig {
+            duplicate: 1.0,
+            ..LinkConfig::default()
+        };
+        delivery.link = LinkEmulator::new(config, Path::new("."), 0).unwrap();
+        let cav = CavId::new("2").unwrap();
+        delivery.enqueue(sent(&cav, 1), &ComputeTimes::default(), 1.0);
+        assert_eq!(delivery.until(1_000_000).len(), 1);
+        let total = delivery.ledger.total();
+        // The pose is received on arrival, the boxes when the ego uses them.
+        assert_eq!((total.sent, total.received), (2, 1));
     }
 
     #[test]

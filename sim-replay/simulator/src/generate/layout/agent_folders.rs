@@ -73,7 +73,7 @@ impl SceneWriter for AgentFolderWriter {
         folders.try_for_each(|folder| make_folder(folder))
     }
 
-    fn write(&self, moment: &Moment, _: &Omissions) -> Result<(), SynthError> {
+    fn write(&self, moment: &Moment, _: &Omissions) -> Result<usize, SynthError> {
         moment.frames.iter().try_for_each(|frame| {
             let files = TickFiles {
                 folder: &self.folders[frame.agent],
@@ -81,7 +81,8 @@ impl SceneWriter for AgentFolderWriter {
                 is_roadside: self.scene.agents[frame.agent].is_roadside,
             };
             (self.write_frame)(&files, frame)
-        })
+        })?;
+        Ok(moment.frames.len())
     }
 
     fn end(&mut self) -> Result<(), SynthError> {

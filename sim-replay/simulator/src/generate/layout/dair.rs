@@ -252,11 +252,11 @@ impl SceneWriter for Dair {
         Ok(())
     }
 
-    fn write(&self, moment: &Moment, omitted: &Omissions) -> Result<(), SynthError> {
+    fn write(&self, moment: &Moment, omitted: &Omissions) -> Result<usize, SynthError> {
         let frames = moment.frames.len();
         let (Some(vehicle), Some(unit)) = (moment.of(0), moment.of(self.unit)) else {
             omitted.add("frames of moments without vehicle or roadside unit", frames);
-            return Ok(());
+            return Ok(0);
         };
         let what = "frames of agents beyond one vehicle and one roadside unit";
         // Both were found above, so there are at least two.
@@ -284,7 +284,7 @@ impl SceneWriter for Dair {
         let path = format!("cooperative/{}/{id}.json", self.cooperative_labels());
         self.write_json(&path, &Value::Array(labels))?;
         locked(&self.rows).push((number, self.rows_of(moment, &id, &unit_id)));
-        Ok(())
+        Ok(2)
     }
 
     fn end(&mut self) -> Result<(), SynthError> {

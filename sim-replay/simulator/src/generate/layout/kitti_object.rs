@@ -66,7 +66,7 @@ impl SceneWriter for KittiObject {
         Ok(())
     }
 
-    fn write(&self, moment: &Moment, _: &Omissions) -> Result<(), SynthError> {
+    fn write(&self, moment: &Moment, _: &Omissions) -> Result<usize, SynthError> {
         for frame in &moment.frames {
             // One block of numbers per agent: a number does not depend on which agents are present.
             let number = self.first_frame + frame.agent * self.moments + moment.index;
@@ -75,7 +75,7 @@ impl SceneWriter for KittiObject {
             write_file(&self.file("calib", number, ".txt"), CALIBRATION)?;
             write_file(&self.file("label_2", number, ".txt"), labels(frame))?;
         }
-        Ok(())
+        Ok(moment.frames.len())
     }
 }
 

@@ -112,9 +112,9 @@ pub(crate) trait SceneWriter: Send + Sync {
     /// Begins a scene. Files of an earlier run under its name are removed.
     fn begin(&mut self, scene: &SceneHeader) -> Result<(), SynthError>;
 
-    /// Writes one capture time of the scene: from any thread, in any order, each once. Data that the layout cannot hold
-    /// are counted in `omitted`.
-    fn write(&self, moment: &Moment, omitted: &Omissions) -> Result<(), SynthError>;
+    /// Writes one capture time of the scene: from any thread, in any order, each once. Returns the number of frames that
+    /// were written. Data that the layout cannot hold are counted in `omitted`.
+    fn write(&self, moment: &Moment, omitted: &Omissions) -> Result<usize, SynthError>;
 
     /// Ends the scene: writes data shared by its capture times.
     fn end(&mut self) -> Result<(), SynthError> {

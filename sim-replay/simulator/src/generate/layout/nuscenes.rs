@@ -75,7 +75,7 @@ impl SceneWriter for NuScenes {
         Ok(())
     }
 
-    fn write(&self, moment: &Moment, _: &Omissions) -> Result<(), SynthError> {
+    fn write(&self, moment: &Moment, _: &Omissions) -> Result<usize, SynthError> {
         let offset = EPOCH_MICROS + self.number as u64 * DAY_MICROS;
         let micros = offset + self.scene.capture_nanos[moment.index] / 1000;
         let name = (self.style.file_name)(self.number, moment.index, micros);
@@ -106,7 +106,7 @@ impl SceneWriter for NuScenes {
             sweeps,
             annotations,
         });
-        Ok(())
+        Ok(moment.frames.len())
     }
 
     fn end(&mut self) -> Result<(), SynthError> {

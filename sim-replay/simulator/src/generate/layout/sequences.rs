@@ -91,7 +91,7 @@ impl SceneWriter for Sequences {
         Ok(())
     }
 
-    fn write(&self, moment: &Moment, omitted: &Omissions) -> Result<(), SynthError> {
+    fn write(&self, moment: &Moment, omitted: &Omissions) -> Result<usize, SynthError> {
         let offset = self.style.epoch_micros + self.scene as u64 * DAY_MICROS;
         let micros = offset + self.capture_nanos[moment.index] / 1000;
         for frame in &moment.frames {
@@ -109,7 +109,7 @@ impl SceneWriter for Sequences {
             };
             locked(&self.sweeps).push((frame.agent, sweep));
         }
-        Ok(())
+        Ok(moment.frames.len())
     }
 
     fn end(&mut self) -> Result<(), SynthError> {

@@ -76,6 +76,28 @@ fn a_converted_data_set_is_the_same_as_a_generated_one() {
 }
 
 #[test]
+fn a_conversion_counts_what_the_layout_does_not_hold() {
+    let folders = [(); 4].map(|()| tempfile::tempdir().unwrap());
+    let [from, same, pairs, single] = folders.each_ref().map(tempfile::TempDir::path);
+    let three = SynthOptions {
+        scenes: 1,
+        agents: 3..=3,
+        ..options(SceneLayout::Opv2v, from)
+    };
+    generate(&three, &|_| {}).unwrap();
+    let same = converted(SceneLayout::Opv2v, from, same).unwrap();
+    assert_eq!((same.agent_frames, same.omitted.len()), (6, 0));
+    let pairs = converted(SceneLayout::Dair, from, pairs).unwrap();
+    let beyond = pairs.omitted["frames of agents beyond one vehicle and one roadside unit"];
+    assert_eq!((pairs.agent_frames, beyond), (4, 2));
+    let single = converted(SceneLayout::KittiObject, from, single).unwrap();
+    for what in ["poses", "yaw rates", "poses by GNSS"] {
+        let found = single.omitted.get(what);
+        assert_eq!(found, Some(&6), "{what}: {:?}", single.omitted);
+    }
+}
+
+#[test]
 fn copies_and_radar_come_through_a_conversion() {
     let [first, second] = [(); 2].map(|()| tempfile::tempdir().unwrap());
     let plain = options(SceneLayout::Opv2v, first.path());

@@ -1,0 +1,206 @@
+//! Fit of boxes to points: turned boxes, wrong sizes and the list of another frame hold fewer of the points near them.
+//! Compares each list with trials of it on the same points, so that no sensor and no scene needs a threshold of its own.
+
+use std::collections::BTreeMap;
+use std::f64::consts::FRAC_PI_2;
+
+use protocol::{CavId, Pose};
+use rayon::prelude::*;
+
+use super::cells::PointCells;
+use crate::frame::{Frame, Object, ObjectClass};
+use crate::{LoadOptions, Problem, Scenario};
+use support::sampling::evenly_spread;
+use support::statistics;
+
+/// Frames of each agent that are read, and the one before and after each.
+const FRAMES: usize = 10;
+/// Least longer side of a vehicle, metres: persons and bicycles are too narrow to tell.
+const LEAST_LENGTH_M: f64 = 2.0;
+/// Reach around a box in the plane in which points count as near, metres.
+const NEAR_M: f64 = 1.0;
+/// Margin of a box in the plane, metres: points lie on its surface.
+const MARGIN_M: f64 = 0.1;
+/// Height above the floor of a box up to which points are of the ground, metres.
+const GROUND_M: f64 = 0.3;
+/// Height above the top of a box up to which points count, metres.
+const ABOVE_M: f64 = 0.2;
+/// Least number of points near a box for its share.
+const ENOUGH_POINTS: usize = 20;
+/// Least number of boxes for which shares are compared.
+const ENOUGH_BOXES: usize = 20;
+/// The same for judging the share of the labels alone.
+const MANY_BOXES: usize = 40;
+/// Two boxes are one if centres and ends are nearer than this, metres.
+const SAME_M: f64 = 0.5;
+/// Share by which a trial holds more than the labels: on sound scenes all trials hold at least 0.06 less, and those that
+/// mend a fault 0.2 more.
+const BETTER_BY: f64 = 0.15;
+/// Share of a trial from which it may be what the labels should be: those that mend a fault hold 0.83 and more.
+const SOUND_SHARE: f64 = 0.7;
+/// Share that labels hold at least: those of sound scenes hold 0.9, boxes of quite another frame 0.4.
+const LEAST_SHARE: f64 = 0.45;
+/// A change of a box: multiples of its heading and its bearing, both seen from the LiDAR, of the LiDAR's heading in the
+/// world, and of a right angle, which sum up to the new heading; a scale; a motion along x and y of the LiDAR, metres.
+type Change = [f64; 7];
+const TRIALS: [(&str, Change); 11] = [
+    ("turned by 90 degrees", [1.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0]),
+    ("of negated heading", [-1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0]),
+    ("negated in world", [-1.0, 0.0, -2.0, 0.0, 1.0, 0.0, 0.0]),
+    ("negated and turned", [-1.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0]),
+    ("turned by the bearing", [1.0, 1.0, 0.0, 0.0, 1.0, 0.0, 0.0]),
+    ("twice as large", [1.0, 0.0, 0.0, 0.0, 2.0, 0.0, 0.0]),
+    ("half as large", [1.0, 0.0, 0.0, 0.0, 0.5, 0.0, 0.0]),
+    ("1.2 m ahead", [1.0, 0.0, 0.0, 0.0, 1.0, 1.2, 0.0]),
+    ("1.2 m behind", [1.0, 0.0, 0.0, 0.0, 1.0, -1.2, 0.0]),
+    ("1.2 m to the left", [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 1.2]),
+    ("1.2 m to the right", [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, -1.2]),
+];
+const OTHER_FRAMES: [&str; 2] = ["of the frame before", "of the frame after"];
+
+/// A list of a frame.
+type ListOf = fn(&Frame) -> &[Object];
+/// The lists of a frame, by the field that a finding names.
+pub(super) const LISTS: [(&str, ListOf); 2] = [
+    ("boxes", |frame| &frame.objects),
+    ("cooperative labels", |frame| {
+        frame.cooperative_objects.as_deref().unwrap_or_default()
+    }),
+];
+
+/// A box in the frame of the LiDAR.
+struct PlacedBox {
+    lidar_from_box: Pose,
+    size_m: [f64; 3],
+}
+
+/// Shares of the labels and of a trial, without the boxes that are in both, by trial.
+pub(super) type Comparisons = BTreeMap<&'static str, [Vec<f64>; 2]>;
+
+/// The problem of a list of an agent that the points contradict; `field` names the list.
+pub(super) fn problem(
+    scenario: &Scenario,
+    (index, agent): (usize, &CavId),
+    (field, list): (&str, ListOf),
+) -> Option<Problem> {
+    let ticks = 0..scenario.ticks.len();
+    let ticks = ticks.filter(|&tick| scenario.is_present(index, tick));
+    let ticks = evenly_spread(&ticks.collect::<Vec<_>>(), FRAMES).into_par_iter();
+    let sweeps = ticks.filter_map(|tick| of_sweep(scenario, index, tick, list));
+    let mut all = Comparisons::new();
+    for (name, compared) in sweeps.collect::<Vec<_>>().into_iter().flatten() {
+        let sums = all.entry(name).or_default().iter_mut();
+        (sums.zip(compared)).for_each(|(sum, shares)| sum.extend(shares));
+    }
+    let reason = format!("agent {agent}: {}", fault(&all)?);
+    Some(Problem::about(&scenario.name, field, &reason))
+}
+
+/// The comparisons on one sweep. `None` without boxes or a pose.
+fn of_sweep(scenario: &Scenario, agent: usize, tick: usize, list: ListOf) -> Option<Comparisons> {
+    let options = LoadOptions::without_points();
+    let load = |tick| scenario.load(agent, tick, &options).ok();
+    let frame = load(tick)?;
+    let lidar_rad = frame.world_from_lidar?.yaw_rad();
+    let labels = placed(&frame, list).filter(|labels| !labels.is_empty())?;
+    let cells = PointCells::new(&scenario.load_points(agent, tick, None).ok()?.points);
+    let trials = TRIALS.map(|(name, change)| {
+        let boxes = labels.iter().map(|one| one.changed(lidar_rad, change));
+        (name, boxes.collect())
+    });
+    let others = [tick.checked_sub(1).and_then(load), load(tick + 1)];
+    let others = OTHER_FRAMES.into_iter().zip(others);
+    let others = others.filter_map(|(name, other)| Some((name, placed(&other?, list)?)));
+    let compared = trials.into_iter().chain(others).map(|(name, boxes)| {
+        let both = [(&labels, &boxes), (&boxes, &labels)];
+        (name, both.map(|(of, others)| shares(of, others, &cells)))
+    });
+    Some(compared.collect())
+}
+
+/// The vehicles of a list. `None` without a pose.
+fn placed(frame: &Frame, list: ListOf) -> Option<Vec<PlacedBox>> {
+    let lidar = frame.world_from_lidar?;
+    let vehicles = list(frame).iter();
+    let vehicles = vehicles.filter(|object| ObjectClass::VEHICLES.contains(&object.class));
+    let boxes = vehicles.map(|object| PlacedBox {
+        lidar_from_box: lidar.from_world(&object.world_from_object),
+        size_m: object.size_m,
+    });
+    Some(boxes.collect())
+}
+
+/// Shares of the boxes that are not among the others and have enough points near them.
+fn shares(boxes: &[PlacedBox], others: &[PlacedBox], cells: &PointCells) -> Vec<f64> {
+    (boxes.iter())
+        .filter(|one| one.size_m[0].max(one.size_m[1]) >= LEAST_LENGTH_M)
+        .filter(|one| !others.iter().any(|other| one.is_same(other)))
+        .filter_map(|one| one.share_inside(cells))
+        .collect()
+}
+
+/// The fault of a list: the trial that fits best if that is clearly better, or boxes that do not fit at all.
+pub(super) fn fault(comparisons: &Comparisons) -> Option<String> {
+    let mean = |shares: &[f64]| statistics::mean(shares).unwrap_or(0.0);
+    let trials = comparisons.iter();
+    let trials = trials.filter(|(_, both)| both.iter().all(|of| of.len() >= ENOUGH_BOXES));
+    let trials = trials.map(|(name, [labels, trial])| (name, mean(labels), mean(trial)));
+    let trials = trials.filter(|(_, _, trial)| *trial >= SOUND_SHARE);
+    let best = trials.max_by(|one, other| (one.2 - one.1).total_cmp(&(other.2 - other.1)));
+    if let Some((name, labels, trial)) = best.filter(|best| best.2 - best.1 >= BETTER_BY) {
+        return Some(format!(
+            "the points fit boxes {name} better: {trial:.2} of the structure near them is inside, {labels:.2} as the \
+             labels are"
+        ));
+    }
+    // Some trials change every box: they have all labels.
+    let all = comparisons.values().map(|[labels, _]| labels);
+    let all = all.max_by_key(|labels| labels.len())?;
+    let (count, share) = (all.len(), mean(all));
+    (count >= MANY_BOXES && share < LEAST_SHARE).then(|| {
+        format!(
+            "{share:.2} of the structure near {count} boxes is inside, expected {LEAST_SHARE} at least: boxes, poses \
+             or points are of other frames or places"
+        )
+    })
+}
+
+impl PlacedBox {
+    /// The box once changed; the heading is that of the LiDAR in the world, radians.
+    fn changed(&self, lidar_rad: f64, change: Change) -> Self {
+        let [own, sight, lidar, right, scale, dx, dy] = change;
+        let [x, y, z] = self.lidar_from_box.translation_m;
+        let heading_rad = own * self.lidar_from_box.yaw_rad() + sight * y.atan2(x);
+        let heading_rad = heading_rad + lidar * lidar_rad + right * FRAC_PI_2;
+        Self {
+            lidar_from_box: Pose::from_xyz_yaw([x + dx, y + dy, z], heading_rad),
+            size_m: self.size_m.map(|size| scale * size),
+        }
+    }
+
+    /// True if the other box is in the same place. Front and back may be exchanged.
+    fn is_same(&self, other: &Self) -> bool {
+        let ([length, ..], [other_length, ..]) = (self.size_m, other.size_m);
+        let [one, other] = [self, other].map(|placed| placed.lidar_from_box);
+        let turned_m = length / 2.0 * (one.yaw_rad() - other.yaw_rad()).sin().abs();
+        let longer_m = (length - other_length).abs() / 2.0;
+        one.planar_distance_m(&other).max(turned_m).max(longer_m) < SAME_M
+    }
+
+    /// Share inside the box of the points above the ground that are in it or near it, if they are enough.
+    fn share_inside(&self, cells: &PointCells) -> Option<f64> {
+        let [length, width, height] = self.size_m.map(|size| size / 2.0);
+        let reach = [length + NEAR_M, width + NEAR_M, height + ABOVE_M];
+        #[expect(clippy::cast_possible_truncation, reason = "rounded to f32")]
+        let reach = reach.map(|metres| metres as f32);
+        let box_from_lidar = self.lidar_from_box.isometry().inverse().cast();
+        let (mut near, mut inside) = (0_usize, 0_usize);
+        for point in cells.points_in(&box_from_lidar, reach, [1.0; 2]) {
+            let [x, y, z] = [point.x, point.y, point.z].map(f64::from);
+            let is_in = x.abs() <= length + MARGIN_M && y.abs() <= width + MARGIN_M;
+            near += usize::from(z >= GROUND_M - height);
+            inside += usize::from(z >= GROUND_M - height && is_in);
+        }
+        (near >= ENOUGH_POINTS).then(|| inside as f64 / near as f64)
+    }
+}
