@@ -107,7 +107,6 @@ mod tests {
             ..frame(2, None)
         };
         assert!(lines.add(Some("s"), &failed).is_continue());
-        assert_eq!(lines.scenarios, ["s"; 2]);
         lines.finish().unwrap();
         let ticks = ["detections.jsonl", "truth.jsonl"].map(|name| {
             let text = std::fs::read_to_string(folder.path().join(name)).unwrap();

@@ -329,11 +329,15 @@ pub(crate) fn unused_weights(scenario: &Scenario, ego: &CavId) -> Option<String>
 
 /// Sentence about the ticks of a scene at which the recording has no frame of the ego: they are none of the run's. Of a
 /// repeated scene those of one lap.
-pub(crate) fn ego_absences(of: &Recorded, ego: &CavId, scene: &SceneConfig) -> Option<String> {
-    let place = of.agents.iter().position(|cav| cav == ego)?;
-    let ticks = (scene.seek..of.ticks.len()).take(scene.frames.unwrap_or(usize::MAX));
-    let absent = ticks.filter(|tick| !of.is_present(place, *tick)).count();
-    let name = &of.name;
+pub(crate) fn ticks_without_ego(
+    recorded: &Recorded,
+    ego: &CavId,
+    scene: &SceneConfig,
+) -> Option<String> {
+    let place = recorded.agents.iter().position(|cav| cav == ego)?;
+    let ticks = (scene.seek..recorded.ticks.len()).take(scene.frames.unwrap_or(usize::MAX));
+    let absent = ticks.filter(|tick| !recorded.is_present(place, *tick));
+    let (name, absent) = (&recorded.name, absent.count());
     (absent > 0).then(|| {
         format!("scenario {name}: no frame of the ego {ego} at {absent} ticks, which do not count")
     })
@@ -379,7 +383,7 @@ mod tests {
         fs::write(&file, "scene: {dir: .}\nmodels: {weights: .}\n").unwrap();
         let mut scene = Scenario::read(&file).unwrap().scene;
         let of = |ego, scene: &SceneConfig| {
-            ego_absences(&recorded, &CavId::new(ego).unwrap(), scene).unwrap_or_default()
+            ticks_without_ego(&recorded, &CavId::new(ego).unwrap(), scene).unwrap_or_default()
         };
         assert_eq!(of("1", &scene), "");
         let all = of("2", &scene);

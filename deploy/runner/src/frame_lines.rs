@@ -19,8 +19,6 @@ pub(crate) struct FrameLines {
     truth: BufWriter<File>,
     /// Created with the first tracks.
     tracks: Option<BufWriter<File>>,
-    /// Scenario of each frame so far, where there are several.
-    pub(crate) scenarios: Vec<String>,
     written: io::Result<()>,
 }
 
@@ -35,7 +33,6 @@ impl FrameLines {
             detections: create(folder, "detections.jsonl")?,
             truth: create(folder, "truth.jsonl")?,
             tracks: None,
-            scenarios: Vec::new(),
             written: Ok(()),
         })
     }
@@ -47,10 +44,6 @@ impl FrameLines {
         scenario: Option<&str>,
         frame: &EvaluatedFrame,
     ) -> ControlFlow<()> {
-        // As in frames.csv, whose rows they name.
-        let has_row = frame.failure.is_none() || frame.true_pose().is_some();
-        let named = scenario.filter(|_| has_row).map(str::to_owned);
-        self.scenarios.extend(named);
         if self.written.is_ok() {
             self.written = self.write(scenario, frame);
         }

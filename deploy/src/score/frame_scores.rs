@@ -122,7 +122,7 @@ impl FrameScores {
     }
 
     /// Ticks at which the truth lacks the ego: it has no sweep there, or the recording has no true pose of it. They
-    /// count in no score, and only those with a result have a record.
+    /// count in no precision, and only those with a result have a record.
     pub fn unplaced(&self) -> &[u64] {
         &self.unplaced
     }

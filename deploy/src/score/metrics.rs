@@ -9,7 +9,7 @@ use dataset::evaluation_protocol::{ApOrder, EvaluationProtocol};
 use protocol::{CavId, Counts, DropReason, Ledger, PoseError, Topic};
 use serde::{Deserialize, Serialize};
 use support::provenance::Provenance;
-use support::statistics::{SUCCESS_M, mean, quantile, sorted};
+use support::statistics::{SUCCESS_M, mean, quantile, share_below, sorted};
 
 use crate::score::{FrameScores, NeighbourRecord};
 
@@ -313,14 +313,13 @@ impl PoseErrors {
     pub fn of(errors: &[PoseError], no_pose: u64) -> Self {
         let distances: Vec<f64> = errors.iter().map(|error| error.distance_m).collect();
         let distances = sorted(&distances);
-        let tried = errors.len() as u64 + no_pose;
-        let near = distances.partition_point(|distance| *distance < SUCCESS_M);
+        let tried = errors.len() + no_pose as usize;
         Self {
             mean_m: mean(&distances),
             p50_m: quantile(&distances, 0.50),
             p95_m: quantile(&distances, 0.95),
             mean_deg: mean(&Vec::from_iter(errors.iter().map(|error| error.angle_deg))),
-            success_3m: (tried > 0).then(|| near as f64 / tried as f64),
+            success_3m: (tried > 0).then(|| share_below(&distances, SUCCESS_M, tried)),
             no_pose,
         }
     }

@@ -15,7 +15,7 @@ pub(crate) struct LinkTraffic {
     pub from: CavId,
     /// Bytes of its messages for this frame.
     pub sent_bytes: u64,
-    /// From publication to arrival of the last of these, milliseconds; `None`: a message of perception has not.
+    /// From publication to arrival of the last of these, milliseconds; `None`: a message of perception did not arrive.
     pub transit_ms: Option<f64>,
     /// Bytes that were on their way when the tick was published: of earlier messages, those that arrived later.
     /// Messages that were lost do not count.
@@ -30,7 +30,7 @@ pub(super) struct LinkSeries(BTreeMap<CavId, LinkMessages>);
 struct LinkMessages {
     /// Streams but the pose, and bytes, by capture time.
     sent: BTreeMap<u64, (BTreeSet<Stream>, u64)>,
-    /// Streams that arrived, and the longest time from publication to arrival, milliseconds, by capture time.
+    /// The same streams as far as they arrived, and the longest time to arrival, milliseconds, by capture time.
     transits: BTreeMap<u64, (BTreeSet<Stream>, f64)>,
     /// Bytes of those that arrived, by time of publication.
     published: Vec<(u64, u64)>,
@@ -60,25 +60,29 @@ impl LinkSeries {
             }
             let link = series.0.entry(cav.clone()).or_default();
             let (stamp, bytes) = (&entry.header.stamp, bytes(entry));
+            // A message of perception has its pose too.
+            let perception = Some(stream).filter(|stream| *stream != Stream::Pose);
             if is_sent {
                 let (streams, sum) = link.sent.entry(stamp.capture_nanos).or_default();
-                // A message of perception has its pose too.
-                streams.extend(Some(stream).filter(|stream| *stream != Stream::Pose));
+                streams.extend(perception);
                 *sum += bytes;
             }
             if is_arrived {
                 let transit_ms = ms_between(stamp.publish_nanos, entry.arrived_nanos);
                 let transit = link.transits.entry(stamp.capture_nanos);
                 let (streams, longest_ms) = transit.or_insert((BTreeSet::new(), transit_ms));
-                streams.insert(stream);
+                streams.extend(perception);
                 *longest_ms = longest_ms.max(transit_ms);
                 link.published.push((stamp.publish_nanos, bytes));
                 link.arrived.push((entry.arrived_nanos, bytes));
             }
         }
         // Poses alone, where the rest is not recorded, are not the traffic of a link.
-        let has_perception = |link: &LinkMessages| link.sent.values().any(|of| !of.0.is_empty());
-        series.0.retain(|_, link| has_perception(link));
+        series.0.retain(|_, link| {
+            let sent = link.sent.values().map(|(streams, _)| streams);
+            let arrived = link.transits.values().map(|(streams, _)| streams);
+            sent.chain(arrived).any(|streams| !streams.is_empty())
+        });
         for link in series.0.values_mut() {
             accumulate(&mut link.published);
             accumulate(&mut link.arrived);
@@ -133,10 +137,10 @@ mod tests {
 
     #[test]
     fn the_transit_of_a_sweep_is_not_that_of_its_pose_where_its_map_is_lost() {
-        let [map, pose] = [Stream::Bev, Stream::Pose].map(|stream| BTreeSet::from([stream]));
+        let map = BTreeSet::from([Stream::Bev]);
         let link = LinkMessages {
             sent: [1, 2].map(|tick| (tick, (map.clone(), 900))).into(),
-            transits: [(1, (map, 300.0)), (2, (pose, 2.0))].into(),
+            transits: [(1, (map, 300.0)), (2, (BTreeSet::new(), 2.0))].into(),
             ..LinkMessages::default()
         };
         let series = LinkSeries([(CavId::new("2").unwrap(), link)].into());

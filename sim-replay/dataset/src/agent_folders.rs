@@ -215,9 +215,9 @@ impl ScenarioFolder {
         sweeps
     }
 
-    /// Capture times of all stems. They count simulator ticks where `data_protocol.yaml` gives the length of a tick: time
-    /// is tick times length. Else stems that are times give them, from the first on; of others the median step is one
-    /// `period_nanos`, from 0 on. Times that no LiDAR has are a problem, and so are equal ones.
+    /// Capture times of all stems. They count simulator ticks where `data_protocol.yaml` gives the length of a tick:
+    /// time is tick times length. Else stems that are times give them, from the first on; of others the median step is
+    /// one `period_nanos`, from 0 on. Times that no LiDAR has, equal ones, and names that are dates are a problem.
     pub(super) fn ticks(&self, period_nanos: u64, problems: &mut Vec<ReadError>) -> Vec<Tick> {
         let tick_nanos = self.tick_nanos().unwrap_or_else(|error| {
             problems.push(error);
@@ -231,9 +231,10 @@ impl ScenarioFolder {
             Keys::Times(nanos) => nanos.clone(),
             _ => (0..stems.len()).map(|index| keys.count(index)).collect(),
         };
-        if matches!(keys, Keys::Times(_)) {
-            problems.extend(time_stamps::step_problem(&self.dir, &numbers));
-        }
+        problems.extend(match &keys {
+            Keys::Times(_) => time_stamps::step_problem(&self.dir, &numbers),
+            _ => time_stamps::date_problem(&self.dir, &stems),
+        });
         let first = numbers.iter().min().copied().unwrap_or(0);
         let frames: Vec<(&str, u64)> = stems.into_iter().zip(numbers).collect();
         let (first, step, nanos) = match (&keys, tick_nanos) {

@@ -4,7 +4,7 @@ use std::str::FromStr;
 
 use support::statistics;
 
-use super::time_stamps::Unit;
+use super::time_stamps::{EPOCH_S, Unit};
 
 /// Least value of a whole number that is a time: nine digits.
 const LEAST_WHOLE_TIME: f64 = 1e8;
@@ -13,8 +13,6 @@ const LEAST_WHOLE_TIME: f64 = 1e8;
 pub(super) const LEAST_PER_STRAY: usize = 10;
 /// Least distance of a stray from the median, in ranges of the other numbers. Times from a start are nearer.
 const LEAST_STRAY_RANGES: f64 = 10.0;
-/// The year 2286 in nanoseconds since 1970: no capture time is later.
-const LATEST_NANOS: u64 = 10_000_000_000_000_000_000;
 /// Digits of nanoseconds.
 const NANOS_DIGITS: usize = 9;
 
@@ -40,8 +38,9 @@ impl Keys {
     /// Counts of ticks of a stated length, nanoseconds, however large. `None` where the names are more or less than a
     /// number, and for times since an epoch, which would lie beyond all years.
     pub(super) fn of_ticks(stems: &[&str], tick_nanos: u64) -> Option<Self> {
-        let is_time = |ticks: &u64| ticks.saturating_mul(tick_nanos) < LATEST_NANOS;
-        parsed(&whole_words(stems)?, is_time).map(Self::Numbers)
+        let tick_s = tick_nanos as f64 * 1e-9;
+        let is_count = |ticks: &u64| *ticks as f64 * tick_s < EPOCH_S.end;
+        parsed(&whole_words(stems)?, is_count).map(Self::Numbers)
     }
 
     fn of_numbered(numbered: &[Numbered<'_>]) -> Option<Self> {

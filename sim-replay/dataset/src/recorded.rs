@@ -186,7 +186,9 @@ impl Recorded {
         let ticks = self.captures(ego);
         let named = others.iter().filter_map(|cav| {
             let off_ms = off_nanos(&ticks, &self.captures(cav))? as f64 / 1e6;
-            Some(format!("{cav} has sweeps {off_ms} ms and more off every sweep of {ego}: it takes part in no tick"))
+            Some(format!(
+                "{cav} has sweeps {off_ms} ms and more off every sweep of {ego}: it takes part in no tick"
+            ))
         });
         named.collect()
     }
@@ -195,10 +197,13 @@ impl Recorded {
     fn in_order(&self) -> Vec<CavId> {
         let truths = self.truth.values();
         let listed = truths.flat_map(|truth| truth.agents.iter().map(|agent| &agent.cav));
-        let unlisted = self.sensors.keys().map(|(_, cav, _)| cav);
+        let sweeps = self.sensors.keys();
+        let sweeps = sweeps.filter(|(_, _, stream)| *stream == Stream::Lidar);
+        let unlisted = sweeps.map(|(_, cav, _)| cav);
+        let with_sweeps: BTreeSet<&CavId> = unlisted.clone().collect();
         let mut agents: Vec<CavId> = Vec::new();
         for cav in listed.chain(unlisted) {
-            if !agents.contains(cav) && !self.captures(cav).is_empty() {
+            if with_sweeps.contains(cav) && !agents.contains(cav) {
                 agents.push(cav.clone());
             }
         }

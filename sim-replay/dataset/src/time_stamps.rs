@@ -9,13 +9,22 @@ use support::{rounding, statistics};
 use super::ReadError;
 
 /// Times since an epoch, seconds: of the years 2001 to 2286.
-const EPOCH_S: Range<f64> = 1e9..1e10;
+pub(super) const EPOCH_S: Range<f64> = 1e9..1e10;
 /// Largest median step of these, seconds.
 const MOST_EPOCH_STEP_S: f64 = 3600.0;
 /// Median steps of the times of a LiDAR, seconds: from 200 Hz to rare key frames.
 const LIDAR_STEP_S: RangeInclusive<f64> = 0.005..=5.0;
 /// Largest median step of other times, seconds.
 const MOST_STEP_S: f64 = 60.0;
+/// Digits and range of the numbers of a date with a time of day.
+const DATE: [(usize, RangeInclusive<u16>); 6] = [
+    (4, 1970..=2285),
+    (2, 1..=12),
+    (2, 1..=31),
+    (2, 0..=23),
+    (2, 0..=59),
+    (2, 0..=60),
+];
 
 /// Unit of a time.
 #[derive(Debug, Clone, Copy, PartialEq, strum::EnumIter)]
@@ -74,8 +83,9 @@ impl Unit {
     }
 }
 
-/// The problem that times since a start, nanoseconds, do not follow one another as those of a LiDAR do, or jump as the
-/// digits of a clock (`101559.9`, `101600.0`) do after every minute.
+/// The problem that times, nanoseconds, are beyond all years; or, where they count from a start, that they do not
+/// follow one another as those of a LiDAR do, or jump as the digits of a clock (`101559.9`, `101600.0`) do after every
+/// minute.
 pub(super) fn step_problem(path: &Path, nanos: &[u64]) -> Option<ReadError> {
     let times_s: Vec<f64> = nanos.iter().map(|nanos| *nanos as f64 * 1e-9).collect();
     let (first, last) = (times_s.first()?, times_s.last()?);
@@ -84,13 +94,40 @@ pub(super) fn step_problem(path: &Path, nanos: &[u64]) -> Option<ReadError> {
     let is_clock = times_s.iter().all(|time| time % 100.0 < 60.0)
         && steps.any(|[a, b]| b % 100.0 < a % 100.0 && (40.0..=45.0).contains(&(b - a)));
     let is_usual = step_s == 0.0 || LIDAR_STEP_S.contains(&step_s);
-    (*first < EPOCH_S.start && (is_clock || !is_usual)).then(|| {
+    let is_doubtful = *first < EPOCH_S.start && (is_clock || !is_usual);
+    (is_doubtful || *last >= EPOCH_S.end).then(|| {
         let reason = format!(
             "taken as times from {first:.3} s to {last:.3} s with a median step of {step_s:.6} s, expected 0.005 to 5 s \
              and no digits of a date or a clock: their unit is doubtful"
         );
         ReadError::malformed(path, reason)
     })
+}
+
+/// The problem that names are dates with a time of day, `2021-08-22-21-41-24`, which nothing reads as times.
+pub(super) fn date_problem(path: &Path, stems: &[&str]) -> Option<ReadError> {
+    let (first, last) = (stems.first()?, stems.last()?);
+    (first != last && stems.iter().all(|stem| is_date(stem))).then(|| {
+        let reason = format!(
+            "names from {first} to {last} are dates, which are not read as times: frames count as evenly spaced"
+        );
+        ReadError::malformed(path, reason)
+    })
+}
+
+/// True for a name whose numbers are year, month, day, hour, minute and second, and no count after them.
+fn is_date(stem: &str) -> bool {
+    let numbers = stem.split(|letter: char| !letter.is_ascii_digit());
+    let numbers: Vec<&str> = numbers.filter(|number| !number.is_empty()).collect();
+    let mut parts = numbers.iter().zip(&DATE);
+    numbers.len() == DATE.len()
+        && parts.all(|(number, (digits, range))| {
+            let number = number
+                .parse::<u16>()
+                .ok()
+                .filter(|_| number.len() == *digits);
+            number.is_some_and(|number| range.contains(&number))
+        })
 }
 
 /// The median of the steps that are not 0: neither a pause in the drive nor equal times decide. 0 without any.
@@ -173,9 +210,31 @@ mod tests {
             found(&[20_230_412_101_559_500.0, 20_230_412_101_559_600.0]),
             1
         );
+        // All of 20 digits are the largest time.
+        assert!(step_problem(Path::new("a"), &[u64::MAX; 2]).is_some());
         assert_eq!(found(&[101_559.8, 101_559.9, 101_600.0, 101_600.1]), 1);
         assert_eq!(found(&[101_559.8, 101_559.9, 101_560.0, 101_560.1]), 0);
         assert_eq!(found(&[101_599.8, 101_599.9, 101_600.0, 101_600.1]), 0);
+    }
+
+    #[test]
+    fn names_that_are_dates_are_named() {
+        let found = |stems: &[&str]| {
+            let problem = date_problem(Path::new("a"), stems);
+            problem.map(|problem| problem.to_string())
+        };
+        let expected = "a: names from 2021-08-22-21-41-59 to 2021-08-22-21-42-00 are dates, which are not read as times: \
+                        frames count as evenly spaced";
+        let dates = ["2021-08-22-21-41-59", "2021-08-22-21-42-00"];
+        assert_eq!(found(&dates).as_deref(), Some(expected));
+        for stems in [
+            ["2021-08-22-21-41-24_1", "2021-08-22-21-41-24_2"],
+            ["2021-08-22-21-41-24", "2021-08-22-21-41-24"],
+            ["2021-08-22-21-41-59", "2021-08-22-21-41-61"],
+            ["000068", "000070"],
+        ] {
+            assert_eq!(found(&stems), None, "{stems:?}");
+        }
     }
 
     #[test]

@@ -47,25 +47,21 @@ impl Row {
         if let Some(replaced) = dropped.remove(&DropReason::LinkQueue) {
             *dropped.entry(DropReason::Superseded).or_default() += replaced;
         }
-        let receivers = seen
-            .ledger
-            .iter()
-            .filter(|(account, _)| account.to.is_some());
-        let held: u64 = receivers.map(|(_, counts)| counts.in_flight).sum();
+        let in_flight = |at_receivers: bool| -> u64 {
+            let accounts = seen.ledger.iter();
+            let accounts = accounts.filter(|(of, _)| of.to.is_some() == at_receivers);
+            accounts.map(|(_, counts)| counts.in_flight).sum()
+        };
+        // The link holds them at the end.
+        let held = in_flight(true);
         if held > 0 {
             *dropped.entry(DropReason::Stale).or_default() += held;
         }
-        let on_the_way: u64 = seen
-            .ledger
-            .iter()
-            .filter(|(account, _)| account.to.is_none())
-            .map(|(_, c)| c.in_flight)
-            .sum();
         let unexplained = if seen.ledger.is_empty() {
             // zenoh reports no drops.
             seen.submissions.len() as i64 - seen.arrivals.len() as i64
         } else if seen.ledger.balance().is_exact() {
-            on_the_way as i64
+            in_flight(false) as i64
         } else {
             i64::MAX
         };

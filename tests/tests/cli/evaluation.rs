@@ -100,6 +100,9 @@ fn a_script_gives_the_precision_of_the_built_in_method_and_the_files_hold_the_fr
         rows.starts_with("scenario,tick,") && rows.lines().count() == 1 + FRAMES,
         "{rows}"
     );
+    let scenario = detections[0]["scenario"].as_str();
+    let names = rows.lines().skip(1).map(|row| row.split(',').next());
+    assert_eq!(names.collect::<Vec<_>>(), [scenario; FRAMES]);
     let curve = fs::read_to_string(frames.join("precision_recall.csv")).unwrap();
     let boxes: usize = detections
         .iter()

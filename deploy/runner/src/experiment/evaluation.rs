@@ -345,6 +345,8 @@ fn judged(
     let out = trial.out.as_ref();
     let files = out.map(|out| frame_files::create(out, method));
     let mut files = files.transpose()?;
+    // Of each record of the scores.
+    let mut scenarios = Vec::new();
     for scenario in data.chosen(trial.scenarios) {
         let Some(ego) = scenario.agents.first() else {
             continue;
@@ -360,6 +362,7 @@ fn judged(
             on_frame();
             written
         })?;
+        scenarios.resize(scores.records().len(), scenario.name.clone());
         // A file could not be written. finish returns the error.
         if judged.is_break() {
             break;
@@ -370,7 +373,7 @@ fn judged(
         let (path, reasons) = (trial.dataset.display(), evaluator.left_out.reasons());
         format!("{path}: there is no frame in it that can be evaluated{reasons}")
     })?;
-    let finished = files.map(|files| frame_files::finish(files, &scores));
+    let finished = files.map(|files| frame_files::finish(files, &scores, &scenarios));
     finished.transpose()?;
     Ok((scores, evaluator))
 }

@@ -40,13 +40,13 @@ pub(crate) fn create(out: &Path, method: Method) -> Result<FrameLines> {
         })
 }
 
-/// Writes the rest, with the scores of the same frames.
+/// Writes the rest, with the scores of the same frames and the scenario of each of their records.
 ///
 /// # Errors
 /// An error with the first error of the operating system.
-pub(crate) fn finish(lines: FrameLines, scores: &FrameScores) -> Result<()> {
+pub(crate) fn finish(lines: FrameLines, scores: &FrameScores, scenarios: &[String]) -> Result<()> {
     let folder = lines.folder.clone();
-    let frames = frames_csv(scores.records(), &BTreeMap::new(), Some(&lines.scenarios));
+    let frames = frames_csv(scores.records(), &BTreeMap::new(), Some(scenarios));
     let curve = scores.precision_recall_csv();
     lines
         .finish()

@@ -12,7 +12,7 @@ use deploy::score::scorer_cav;
 use protocol::{KeyExpr, Reconciliation, Role, RunId};
 use support::output;
 
-use crate::fleet::{Fleet, ego_absences, unused_weights};
+use crate::fleet::{Fleet, ticks_without_ego, unused_weights};
 use crate::run::RunError;
 
 /// Settings of a run beside its scenario.
@@ -60,8 +60,8 @@ pub(super) fn in_folder(
     go: impl FnOnce(&RunId, &RunFolder) -> Result<RunResult, RunError>,
 ) -> Result<RunResult, RunError> {
     let unused = unused_weights(&fleet.scenario, &fleet.ego);
-    let absent = ego_absences(&fleet.recorded, &fleet.ego, &fleet.scenario.scene);
-    unused.into_iter().chain(absent).for_each(output::note);
+    let without_ego = ticks_without_ego(&fleet.recorded, &fleet.ego, &fleet.scenario.scene);
+    unused.into_iter().chain(without_ego).for_each(output::note);
     let named = fleet.scenario.run.clone();
     let run = named.unwrap_or_else(|| name_of_now(options.prefix));
     let folder = RunFolder::create(&options.runs, &run)?;

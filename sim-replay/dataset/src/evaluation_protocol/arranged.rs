@@ -24,10 +24,7 @@ impl ProtocolConfig {
         frames: Option<usize>,
     ) -> Result<(EvaluationProtocol, Vec<Scenario>), FileError> {
         let scored = recording_of(path).map(|file| ScoredRun::beside(&file));
-        let scored = scored.transpose();
-        let scored =
-            scored.map_err(|cause| FileError::new(path, format!("its scores: {cause}")))?;
-        let mut scored = scored.unwrap_or_default();
+        let mut scored = scored.transpose()?.unwrap_or_default();
         let protocol = self.resolve_over(scored.protocol.clone(), dataset.layout);
         let protocol = protocol
             .map_err(|problem| FileError::new(path, format!("evaluation protocol: {problem}")))?;

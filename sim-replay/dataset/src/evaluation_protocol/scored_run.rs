@@ -6,7 +6,9 @@ use std::path::Path;
 
 use protocol::CavId;
 use serde::Deserialize;
+use serde::de::DeserializeOwned;
 use serde_json::Value;
+use support::file_error::{AtFile, FileError};
 
 use super::{EgoKind, EvaluationProtocol};
 use crate::Scenario;
@@ -25,14 +27,10 @@ impl ScoredRun {
     ///
     /// # Errors
     /// The error of a file that cannot be read.
-    pub fn beside(recording: &Path) -> io::Result<Self> {
-        let metrics = first_value(&recording.with_file_name("metrics.json"))?;
-        let result = first_value(&recording.with_file_name("detections.jsonl"))?;
+    pub fn beside(recording: &Path) -> Result<Self, FileError> {
         Ok(Self {
-            protocol: metrics
-                .get("protocol")
-                .map_or(Ok(None), Option::deserialize)?,
-            ego: result.get("ego").map_or(Ok(None), Option::deserialize)?,
+            protocol: first_entry(&recording.with_file_name("metrics.json"), "protocol")?,
+            ego: first_entry(&recording.with_file_name("detections.jsonl"), "ego")?,
         })
     }
 
@@ -51,15 +49,19 @@ impl ScoredRun {
     }
 }
 
-/// The first JSON value of a file; null if there is no such file.
-fn first_value(path: &Path) -> io::Result<Value> {
+/// An entry of the first JSON value of a file; `None` if there is no such file or entry.
+fn first_entry<T: DeserializeOwned>(path: &Path, key: &str) -> Result<Option<T>, FileError> {
     let file = match File::open(path) {
-        Err(cause) if cause.kind() == io::ErrorKind::NotFound => return Ok(Value::Null),
-        opened => BufReader::new(opened?),
+        Err(cause) if cause.kind() == io::ErrorKind::NotFound => return Ok(None),
+        opened => BufReader::new(opened.at(path)?),
     };
     let values = serde_json::Deserializer::from_reader(file);
-    let first = values.into_iter().next().transpose()?;
-    Ok(first.unwrap_or_default())
+    let first: Option<Value> = values.into_iter().next().transpose().at(path)?;
+    match first.as_ref().and_then(|first| first.get(key)) {
+        None => Ok(None),
+        Some(entry) => Option::<T>::deserialize(entry)
+            .map_err(|cause| FileError::new(path, format!("{key}: {cause}"))),
+    }
 }
 
 #[cfg(test)]
@@ -94,6 +96,7 @@ mod tests {
         let agents: Vec<&str> = arranged.agents.iter().map(CavId::as_str).collect();
         assert_eq!(agents, ["2", "1", "3"]);
         fs::write(folder.path().join("detections.jsonl"), "{").unwrap();
-        assert!(ScoredRun::beside(&recording).is_err());
+        let error = ScoredRun::beside(&recording).unwrap_err();
+        assert!(error.path.ends_with("detections.jsonl"), "{error}");
     }
 }

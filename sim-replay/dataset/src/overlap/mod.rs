@@ -18,8 +18,8 @@ const CANDIDATES: usize = 24;
 const SPREAD: usize = 3;
 const TURNS: usize = 2;
 /// Sweeps after the first of a spread pair that are tried for one whose stated motion is nearest [`JUDGED_M`], metres:
-/// so far apart, a wrong scale or another drive differs by more than [`OTHER_M`]. It is used from half of that motion on,
-/// where the successive sweeps have less, and within the turns that are searched, radians.
+/// so far apart, a wrong scale or another drive differs by more than [`OTHER_M`]. It is used from half of that motion
+/// on, where the successive sweeps have less, and within the turns that are searched, radians.
 const LATER_STEPS: [usize; 7] = [2, 3, 4, 6, 9, 13, 19];
 const JUDGED_M: f64 = 4.0;
 const MOST_TURN_RAD: f64 = 0.15;
@@ -63,6 +63,8 @@ struct SweepPair {
     ticks: [usize; 2],
     /// Motion by the poses: `first_from_second`.
     stated: Isometry3<f64>,
+    /// True for a pair whose first sweep is that of a nearer pair, too.
+    is_farther: bool,
 }
 
 /// A pair whose poses the sweeps contradict.
@@ -71,9 +73,11 @@ struct Contradiction {
     /// Overlap at the stated motion.
     overlap: f32,
     best: Match,
+    /// True if the structure rests however far the poses move.
+    is_resting: bool,
 }
 
-/// One problem for each agent of a scenario whose sweeps contradict its poses. Reads 24 sweeps of each agent at most.
+/// One problem for each agent of a scenario whose sweeps contradict its poses. Reads 21 sweeps of each agent at most.
 /// Agents that stand, sweeps without structure and unreadable frames give none, nor do the independent frames of KITTI
 /// object.
 pub fn pose_problems(scenario: &Scenario) -> Vec<Problem> {
@@ -87,12 +91,16 @@ pub fn pose_problems(scenario: &Scenario) -> Vec<Problem> {
 }
 
 fn agent_problem(scenario: &Scenario, index: usize, agent: &CavId) -> Option<Problem> {
-    let judged: Vec<Option<Contradiction>> = pairs(scenario, index)
-        .into_iter()
-        .filter_map(|pair| judge(scenario, index, pair))
-        .collect();
+    let pairs = pairs(scenario, index).into_iter();
+    let judged = pairs.filter_map(|pair| Some((pair, judge(scenario, index, pair)?)));
+    let judged: Vec<(SweepPair, Option<Contradiction>)> = judged.collect();
     let count = judged.len();
-    let wrong: Vec<Contradiction> = judged.into_iter().flatten().collect();
+    let near = judged.iter().filter(|(pair, _)| !pair.is_farther).count();
+    let wrong = judged.into_iter().filter_map(|(_, wrong)| wrong);
+    let mut wrong: Vec<Contradiction> = wrong.collect();
+    // All sweeps in the frame of a map rest; dense traffic hides what does not in some.
+    let resting = wrong.iter().filter(|one| one.is_resting).count();
+    wrong.retain(|one| !one.is_resting || 2 * resting > near);
     let first = wrong.first()?;
     // One pair of several may be an object that fills the view.
     if wrong.len() < 2 && count > 1 {
@@ -142,10 +150,9 @@ fn pairs(scenario: &Scenario, agent: usize) -> Vec<SweepPair> {
         let [a, b] = [a, b].map(|pair| pair.stated.rotation.angle());
         b.total_cmp(&a)
     });
-    let farther = chosen.clone();
-    let farther = farther
-        .iter()
-        .filter_map(|near| farther_pair(scenario, agent, &ticks, near));
+    let farther = chosen.iter();
+    let farther = farther.filter_map(|near| farther_pair(scenario, agent, &ticks, near));
+    let farther: Vec<SweepPair> = farther.collect();
     chosen.extend(candidates.into_iter().take(TURNS).chain(farther));
     chosen
 }
@@ -160,18 +167,22 @@ fn farther_pair(
     let moved_m = |pair: &SweepPair| pair.stated.translation.vector.norm();
     let from_best = |pair: &SweepPair| (moved_m(pair) - JUDGED_M).abs();
     let start = near.ticks[0];
-    // A fast drive is judged by successive sweeps.
-    let place = ticks
-        .binary_search(&start)
-        .ok()
-        .filter(|_| moved_m(near) < JUDGED_M / 2.0)?;
-    let later = LATER_STEPS
-        .iter()
-        .filter_map(|step| ticks.get(place + step));
+    if moved_m(near) >= JUDGED_M / 2.0 {
+        // A fast drive is judged by successive sweeps.
+        return None;
+    }
+    let place = ticks.binary_search(&start).ok()?;
+    let later = LATER_STEPS.iter();
+    let later = later.filter_map(|step| ticks.get(place + step));
     let pairs = later.filter_map(|later| pair_of(scenario, agent, [start, *later]));
-    let pairs = pairs.filter(|pair| pair.stated.rotation.angle() < MOST_TURN_RAD);
+    let pairs = pairs.filter(|pair| {
+        moved_m(pair) >= JUDGED_M / 2.0 && pair.stated.rotation.angle() < MOST_TURN_RAD
+    });
     let best = pairs.min_by(|a, b| from_best(a).total_cmp(&from_best(b)));
-    best.filter(|best| moved_m(best) >= JUDGED_M / 2.0)
+    best.map(|best| SweepPair {
+        is_farther: true,
+        ..best
+    })
 }
 
 /// A sweep and its successor, or a later one where that is close.
@@ -199,6 +210,7 @@ fn pair_of(scenario: &Scenario, agent: usize, ticks: [usize; 2]) -> Option<Sweep
     Some(SweepPair {
         ticks,
         stated: world_from_first?.inv_mul(&world_from_second?),
+        is_farther: false,
     })
 }
 
@@ -219,21 +231,24 @@ fn judge(scenario: &Scenario, agent: usize, pair: SweepPair) -> Option<Option<Co
     let is_better = best.overlap > CLEAR.max(BETTER_RATIO * overlap).max(overlap + BETTER_BY);
     // The search does not reach a long motion: sweeps this far apart look alike at a wrong motion, too.
     let is_judged = moved_m <= SEARCH_M[1] || overlap < FAR_OVERLAP;
-    // Vehicles that move as the sensor does suggest no motion; static structure still overlaps at the stated motion.
+    // Vehicles that move as the sensor does suggest no motion; static structure still overlaps at the stated motion, if
+    // that is not too long.
     let best_m = f64::from(best.first_from_second.translation.vector.norm());
-    let is_traffic =
-        best_m < ALONGSIDE * moved_m && overlap >= LEAST_OVERLAP && best.overlap < REPEATED;
+    let is_along = best_m < ALONGSIDE * moved_m;
+    let is_explained = pair.is_farther || overlap >= LEAST_OVERLAP;
+    let is_traffic = is_along && is_explained && best.overlap < REPEATED;
     // No motion overlaps, although the poses are close: the sweeps are of two places.
     let is_elsewhere = moved_m < NEAR_M && overlap.max(best.overlap) < LEAST_OVERLAP;
     let is_wrong =
         is_repeated || (is_better && is_other && is_judged && !is_traffic) || is_elsewhere;
-    if !is_wrong && best_m < ALONGSIDE * moved_m {
+    if !is_wrong && is_along && !pair.is_farther {
         return Some(at_rest(scenario, agent, pair.ticks[0], &first));
     }
     Some(is_wrong.then_some(Contradiction {
         pair,
         overlap,
         best,
+        is_resting: false,
     }))
 }
 
@@ -259,6 +274,7 @@ fn at_rest(
         pair,
         overlap,
         best,
+        is_resting,
     })
 }
 

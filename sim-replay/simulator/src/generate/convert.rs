@@ -112,6 +112,7 @@ fn write_moments(
         locked(left_out).add_tick(&loaded);
         done();
         if loaded.frames.first().is_none_or(|(agent, _)| *agent != 0) {
+            omitted.add("frames of moments without the ego", loaded.frames.len());
             return Ok(0);
         }
         let frames = loaded.frames.into_iter().map(|(agent, frame)| {
@@ -143,6 +144,7 @@ fn count_losses(agent: &AgentFrame, layout: SceneLayout, omitted: &Omissions) {
     let speeds = speeds.chain([frame.speed_mps]).flatten().count();
     let vans = (frame.objects.iter()).filter(|object| object.class == ObjectClass::Van);
     let gnss = frame.gnss_world_from_vehicle.iter().len();
+    let cooperative = frame.cooperative_objects.iter().flatten().count();
     let has_speeds = matches!(layout, Opv2v | V2v4real | V2xreal);
     let has_vans = !matches!(layout, V2xsim | Mars);
     for (what, count, is_held) in [
@@ -153,9 +155,10 @@ fn count_losses(agent: &AgentFrame, layout: SceneLayout, omitted: &Omissions) {
         ("yaw rates", frame.yaw_rate_rad_s.iter().len(), is_opv2v),
         ("poses by GNSS", gnss, is_opv2v),
         ("speeds", speeds, has_speeds),
+        ("boxes of cooperative labels", cooperative, false),
         ("vans, which are cars there", vans.count(), has_vans),
     ] {
-        omitted.add(what, if is_held { 0 } else { count });
+        omitted.add(what, count * usize::from(!is_held));
     }
 }
 

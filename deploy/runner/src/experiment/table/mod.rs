@@ -16,7 +16,7 @@ use support::atomic_file;
 use support::cli::NotWritten;
 use support::file_digests::FileDigests;
 use support::output;
-use support::sampling::repeated;
+use support::sampling::{distinct, repeated};
 
 pub use text::{csv, markdown};
 
@@ -57,10 +57,10 @@ pub fn run(
     atomic_file::create_folder(&cells).with_context(|| NotWritten(cells.clone()))?;
     generate(experiment)?;
     let data = OpenedData::open(&experiment.trial()?)?;
-    let of_tables = experiment.tables.iter().filter_map(|table| table.scenarios);
-    let most = of_tables.chain(experiment.scenarios).max();
-    let lacking = data.lacking(most, experiment.frames);
-    lacking.into_iter().for_each(output::note);
+    let lacking = experiment.tables.iter().flat_map(|table| {
+        data.lacking(table.scenarios.or(experiment.scenarios), experiment.frames)
+    });
+    distinct(lacking).into_iter().for_each(output::note);
     let run = TableRun {
         experiment,
         cells,

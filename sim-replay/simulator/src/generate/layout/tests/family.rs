@@ -77,8 +77,8 @@ fn a_converted_data_set_is_the_same_as_a_generated_one() {
 
 #[test]
 fn a_conversion_counts_what_the_layout_does_not_hold() {
-    let folders = [(); 4].map(|()| tempfile::tempdir().unwrap());
-    let [from, same, pairs, single] = folders.each_ref().map(tempfile::TempDir::path);
+    let folders = [(); 5].map(|()| tempfile::tempdir().unwrap());
+    let [from, same, pairs, single, fewer] = folders.each_ref().map(tempfile::TempDir::path);
     let three = SynthOptions {
         scenes: 1,
         agents: 3..=3,
@@ -95,6 +95,11 @@ fn a_conversion_counts_what_the_layout_does_not_hold() {
         let found = single.omitted.get(what);
         assert_eq!(found, Some(&6), "{what}: {:?}", single.omitted);
     }
+    let sweep = open(from).scenarios[0].points_path(0, 1, None).unwrap();
+    std::fs::write(sweep.with_extension("yaml"), "vehicles: {}\n").unwrap();
+    let fewer = converted(SceneLayout::Opv2v, from, fewer).unwrap();
+    let without = fewer.omitted["frames of moments without the ego"];
+    assert_eq!((fewer.agent_frames, without), (3, 2));
 }
 
 #[test]
