@@ -111,13 +111,13 @@ fn open(dir: &Path, options: &OpenOptions, problems: &mut Vec<ReadError>) -> Res
         timed.insert((nanos, index), cloud);
     }
     without.report("cloud", problems);
-    let doubt = if matches!(keys, Keys::Times(_)) || poses.times().is_some() {
+    let unclear = if matches!(keys, Keys::Times(_)) || poses.times().is_some() {
         let nanos: Vec<u64> = timed.keys().map(|(nanos, _)| *nanos).collect();
         time_stamps::step_problem(&path, &nanos)
     } else {
         time_stamps::date_problem(dir, &stems)
     };
-    problems.extend(doubt);
+    problems.extend(unclear);
     let of_poses = path.file_name().unwrap_or_default().display();
     let mut join = format!("{} poses of {of_poses} by {}", timed.len(), joined.by);
     if used < rows {
