@@ -83,14 +83,17 @@ pub fn run(
     let presence = bus.announce(Role::Link)?;
     node.carry(stop)?;
     let mut report = node.report;
-    report.under_way = node.kept.len() as u64;
-    let ages = node.kept.values().map(|arrival| arrival.at.elapsed());
-    let longest = ages.max().unwrap_or_default();
-    report.longest_ms = u64::try_from(longest.as_millis()).unwrap_or(u64::MAX);
-    // Messages that would have arrived after the end are in flight, those of a link that is stuck are lost.
-    let kept = node.kept.values();
-    for stuck in kept.filter(|arrival| arrival.at.elapsed() > Duration::from_millis(STUCK_MS)) {
-        bus.stats().dropped(&stuck.topic, DropReason::Stale);
+    let mut kept = node.kept;
+    // Of these only a copy is in flight.
+    kept.retain(|id, _| !node.repeated.contains(id));
+    for arrival in kept.values() {
+        let age_ms = u64::try_from(arrival.at.elapsed().as_millis()).unwrap_or(u64::MAX);
+        report.under_way += 1;
+        report.longest_ms = report.longest_ms.max(age_ms);
+        // Messages that would have arrived after the end are in flight, those of a link that is stuck are lost.
+        if age_ms > STUCK_MS {
+            bus.stats().dropped(&arrival.topic, DropReason::Stale);
+        }
     }
     let vehicles = node.vehicles.into_values();
     vehicles
@@ -123,6 +126,8 @@ struct LinkNode<'a> {
     rejected: BTreeSet<CavId>,
     /// Messages in flight, by id.
     kept: BTreeMap<u64, Arrival>,
+    /// Ids of those that have arrived, and whose copy is in flight.
+    repeated: BTreeSet<u64>,
     /// Total bytes of the kept messages.
     kept_bytes: u64,
     next_id: u64,
@@ -155,6 +160,7 @@ impl<'a> LinkNode<'a> {
             vehicles: BTreeMap::new(),
             rejected: BTreeSet::new(),
             kept: BTreeMap::new(),
+            repeated: BTreeSet::new(),
             kept_bytes: 0,
             next_id: 0,
             began: None,
@@ -360,7 +366,10 @@ impl<'a> LinkNode<'a> {
             self.bus.stats().received(&arrival.topic);
         }
         // A message that arrives twice is kept until its copy is sent.
-        if !is_repeated {
+        if is_repeated {
+            self.repeated.insert(packet.id);
+        } else {
+            self.repeated.remove(&packet.id);
             self.release(packet.id);
         }
     }

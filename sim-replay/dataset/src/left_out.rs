@@ -153,7 +153,10 @@ impl fmt::Display for LeftOut {
             (self.ticks, "ticks (the ego's frame cannot be used)"),
             (self.frames, "frames of other agents that cannot be read"),
             (self.parts, "objects or other parts of frames"),
-            (self.failed, "frames that could not be computed"),
+            (
+                self.failed,
+                "frames that could not be computed, or methods without any detection",
+            ),
             (self.files, "files or folders"),
         ];
         let counts = counts.into_iter().filter(|(count, _)| *count > 0);

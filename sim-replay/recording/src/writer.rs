@@ -83,7 +83,8 @@ impl RecordingWriter<File> {
     /// A new file that `write` writes and finishes, and that has its name only then.
     ///
     /// # Errors
-    /// [`RecordingError::Io`] if the file exists already; those of `write`. No part of the file is left then.
+    /// [`RecordingError::Io`] if the file exists already, or an unfinished one, of a run that was killed; those of `write`.
+    /// No part of the file is left then.
     pub(super) fn whole<T>(
         path: &Path,
         options: RecordingOptions,
@@ -92,10 +93,10 @@ impl RecordingWriter<File> {
         if path.exists() {
             return Err(RecordingError::io(path)(ErrorKind::AlreadyExists.into()));
         }
-        let part = path.with_extension("mcap.unfinished");
-        let file = File::create(&part).map_err(RecordingError::io(&part));
-        let named = file.and_then(|file| {
-            let written = write(&mut Self::over(file, &part, options)?)?;
+        let part = path.with_added_extension("unfinished");
+        // Never over an older one: it may be the recording that is read, or one that another process writes.
+        let mut writer = Self::create(&part, options)?;
+        let named = write(&mut writer).and_then(|written| {
             let named = fs::rename(&part, path).and_then(|()| atomic_file::sync_name(path));
             named.map_err(RecordingError::io(path)).map(|()| written)
         });

@@ -411,13 +411,14 @@ impl<'a> Replay<'a> {
 
     /// In lockstep, waits until every ego that has a frame at the tick has answered.
     fn wait_for_answers(&mut self, planned: &Planned) {
-        if self.options.lockstep.is_empty() {
-            return;
-        }
         let capture_nanos = planned.capture_nanos;
         let egos = self.options.lockstep.iter();
         let egos = egos.filter(|ego| self.present.contains(*ego));
         let mut missing: BTreeSet<CavId> = egos.cloned().collect();
+        if missing.is_empty() {
+            // The next tick is at its time: the agents have that of a tick to compute.
+            return;
+        }
         let deadline = end_of(self.options.answer_timeout);
         while !missing.is_empty() {
             match self.inbox.take(deadline) {

@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use agent_offline::TrainingBar;
+use agent_offline::sweep_database::repeated;
 use anyhow::{Context, Result};
 use clap::ArgGroup;
 use dataset::Layout;
@@ -25,6 +26,7 @@ use training::train::{self, TrainConfig};
 use super::DataSets;
 use support::bounded_file;
 use support::cli::BadInput;
+use support::output;
 
 /// Largest file of a network, bytes.
 const MAX_NETWORK_BYTES: u64 = 1 << 20;
@@ -215,6 +217,15 @@ impl Arguments {
             std::fs::read_dir(folder)
                 .map_err(|error| BadInput::new(format!("{}: {error}", folder.display())))
                 .context("datasets")?;
+        }
+        if let Some(reason) = repeated(&self.data.data).map_err(BadInput::of)? {
+            return Err(BadInput::new(reason).into());
+        }
+        let all = self.data.data.iter().chain(&self.validation);
+        if let Some(reason) = repeated(all).map_err(BadInput::of)? {
+            output::note(format_args!(
+                "--validation: {reason}: its AP is of scenes trained with"
+            ));
         }
         let protocol = self.protocol.resolve(Layout::OPV2V);
         let rule = protocol.map_err(BadInput::new)?.ground_truth;

@@ -337,8 +337,15 @@ fn a_file_that_is_not_written_as_a_whole_leaves_nothing() {
     failed.unwrap_err();
     assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0);
     RecordingWriter::whole(&to, options, RecordingWriter::finish).unwrap();
-    let error = RecordingWriter::whole(&to, options, RecordingWriter::finish).unwrap_err();
-    assert!(error.to_string().contains("whole.mcap: "), "{error}");
+    let part = folder.path().join("other.mcap.unfinished");
+    std::fs::write(&part, "kept").unwrap();
+    for (name, existing) in [("whole.mcap", &to), ("other.mcap", &part)] {
+        let to = folder.path().join(name);
+        let error = RecordingWriter::whole(&to, options, RecordingWriter::finish).unwrap_err();
+        let expected = format!("{}: ", existing.display());
+        assert!(error.to_string().contains(&expected), "{error}");
+    }
+    assert_eq!(std::fs::read(&part).unwrap(), b"kept");
 }
 
 #[test]
