@@ -323,10 +323,11 @@ class DataSet:
         """Names of the scenarios, whose frames follow each other."""
     @property
     def agents(self) -> dict[str, list[str]]:
-        """Agents of each scenario that take part by the protocol of its layout, the ego first; empty for a recording."""
+        """Agents of each scenario that take part by the protocol of :func:`read`, the ego first; empty for a recording."""
     @property
     def problems(self) -> list[str]:
-        """Files that cannot be read, each with its reason. Those of a frame are in :attr:`Frame.problems`."""
+        """Files that cannot be read, each with its reason, and scenarios without an ego of the protocol of :func:`read`.
+        Those of a frame are in :attr:`Frame.problems`."""
     def __len__(self) -> int: ...
     def __getitem__(self, index: int) -> Frame: ...
     def __iter__(self) -> Iterator[Frame]: ...

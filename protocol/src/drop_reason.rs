@@ -11,7 +11,7 @@ named! {
         LinkQueue = "link_queue",
         /// Replaced by a newer message before it was used.
         Superseded = "superseded",
-        /// Too old on arrival.
+        /// Too old on arrival, or held by the emulated link for too long when the run ended.
         Stale = "stale",
         /// The same message had arrived before.
         Duplicate = "duplicate",
@@ -53,8 +53,8 @@ named! {
 }
 
 impl DropReason {
-    /// True if data were lost that should have been used: not by the emulated link, not because they were rightly rejected,
-    /// and not a copy of what had arrived.
+    /// True if data were lost that should have been used: not by the emulated link, not because they were rightly
+    /// rejected, and not a copy of what had arrived.
     pub fn is_loss(self) -> bool {
         !matches!(
             self,

@@ -98,6 +98,14 @@ pub enum WireError {
         /// Size found.
         found: u64,
     },
+    /// A text with a control character, which could forge lines of a terminal.
+    #[error("{what}: control character {found:?}, none is permitted")]
+    ControlCharacter {
+        /// Name of the field.
+        what: &'static str,
+        /// The first one.
+        found: char,
+    },
     /// The grid is not the agreed one: that of the message and the agreed one.
     #[error("feature map has the grid {0}")]
     Grid(String),
@@ -165,6 +173,7 @@ impl WireError {
             Self::HeaderChecksum { .. } | Self::Checksum { .. } => DropReason::Checksum,
             Self::Limit { .. }
             | Self::Shape { .. }
+            | Self::ControlCharacter { .. }
             | Self::Grid { .. }
             | Self::Budget { .. }
             | Self::NoConfidence(_) => DropReason::Shape,

@@ -7,7 +7,7 @@ named! {
     pub enum MisbehaviourReason {
         /// Its reported position is wrong, or it detects nothing of the objects around it.
         PositionMismatch = "position_mismatch",
-        /// It reports vehicles that do not exist.
+        /// It reports vehicles that do not exist, or with another heading or size than they have.
         GhostObjects = "ghost_objects",
         /// Its message copies that of another vehicle.
         Duplicated = "duplicated",
@@ -15,7 +15,8 @@ named! {
         Inconsistent = "inconsistent",
         /// It reports a position that it cannot have reached.
         ImplausibleMotion = "implausible_motion",
-        /// There is no evidence against it, but none for it yet.
+        /// Not accepted yet (a new sender of boxes), or not yet again: the average of its evidence is below 0.7 log
+        /// odds, the limit of readmission. Below -0.7, the limit of exclusion, the evidence is named instead.
         Probation = "probation",
         /// Its feature map has values that the network does not give.
         ImplausibleValues = "implausible_values",

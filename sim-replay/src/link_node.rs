@@ -84,7 +84,7 @@ pub fn run(
     node.carry(stop)?;
     let mut report = node.report;
     let mut kept = node.kept;
-    // Of these only a copy is in flight.
+    // A message that has arrived is not in flight, although its copy is.
     kept.retain(|id, _| !node.repeated.contains(id));
     for arrival in kept.values() {
         let age_ms = u64::try_from(arrival.at.elapsed().as_millis()).unwrap_or(u64::MAX);

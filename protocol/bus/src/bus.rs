@@ -271,7 +271,7 @@ impl Bus {
         topic.in_run(&self.identity.run)
     }
 
-    /// [`Self::leave`] at the end of a program, which closes a session that does not close in time.
+    /// [`Self::leave`] at the end of a program: a session that does not close in time ends with the process.
     pub fn leave_at_end(self) {
         if let Err(overdue) = self.leave(shutdown::STOP_LIMIT) {
             tracing::warn!("{overdue}");

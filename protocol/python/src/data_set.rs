@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use dataset::evaluation_protocol::{EvaluationProtocol, ProtocolConfig};
+use dataset::evaluation_protocol::{EvaluationProtocol, ProtocolConfig, lacking};
 use dataset::{Layout, LoadOptions, Scenario};
 use pyo3::exceptions::PyIndexError;
 use pyo3::types::PyAnyMethods;
@@ -24,7 +24,7 @@ pub(crate) struct DataSet {
     layout: &'static str,
     #[pyo3(get)]
     scenarios: Vec<String>,
-    /// Agents of each scenario that take part by the protocol of the layout, the ego first; none of a recording.
+    /// Agents of each scenario that take part by the protocol, the ego first; none of a recording.
     #[pyo3(get)]
     agents: BTreeMap<String, Vec<String>>,
     #[pyo3(get)]
@@ -169,10 +169,13 @@ pub(crate) fn read(
         let mut dataset = dataset::open(&path).map_err(error)?;
         let asked = protocol;
         let protocol = protocols.resolve(dataset.layout).map_err(error)?;
+        let mut problems: Vec<String> = dataset.problems.iter().map(ToString::to_string).collect();
         if asked.is_some() {
             // As in an evaluation, the frames are those of the protocol's ego.
             let arranged = protocols.arrange_all(&path, &dataset, None);
-            dataset.scenarios = arranged.map_err(error)?.1;
+            let (_, arranged) = arranged.map_err(error)?;
+            problems.extend(lacking(&dataset.scenarios, &arranged, None, None));
+            dataset.scenarios = arranged;
         }
         let scenarios = &dataset.scenarios;
         let arranged = { scenarios.iter() }.filter_map(|scenario| protocol.arrange(scenario));
@@ -185,7 +188,7 @@ pub(crate) fn read(
             layout: dataset.layout.name(),
             scenarios: scenarios.iter().map(|one| one.name.clone()).collect(),
             agents: agents.collect(),
-            problems: dataset.problems.iter().map(ToString::to_string).collect(),
+            problems,
             count: scenarios.iter().map(|one| one.ticks.len()).sum(),
             options,
             asked,

@@ -49,7 +49,7 @@ impl RecordingFrames {
         let damage = recording.damage().iter().map(ToString::to_string);
         let mut problems: Vec<String> = damage.collect();
         let scores = ScoredRun::beside(path).unwrap_or_else(|cause| {
-            problems.push(format!("scores beside {}: {cause}", path.display()));
+            problems.push(cause.to_string());
             ScoredRun::default()
         });
         let ego = scores.ego.map(|ego| ego.to_string());

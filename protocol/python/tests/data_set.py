@@ -55,7 +55,7 @@ def test_agents_that_do_not_take_part_annotate_nothing(run):
 
 def test_frames_are_those_of_the_ego_of_the_protocol(run):
     root = run.work / "gaps"
-    for cav, stems in (("1", range(3)), ("-1", range(1, 4))):
+    for cav, stems in (("both/1", range(3)), ("both/-1", range(1, 4)), ("single/1", range(3))):
         (root / cav).mkdir(parents=True)
         for stem in stems:
             (root / cav / f"{stem:06}.yaml").write_text("lidar_pose: [0, 0, 2, 0, 0, 0]\nvehicles: {}\n")
@@ -65,6 +65,7 @@ def test_frames_are_those_of_the_ego_of_the_protocol(run):
     assert [frame.ego for frame in by_units] == ["-1"] * 3 and by_layout[0].ego == "1"
     assert by_units[0].capture_time_ns > by_layout[0].capture_time_ns
     refuses(lambda: by_layout[0].ground_truth(protocol="v2xreal-i2i"), "read(path, protocol=\"v2xreal-i2i\")")
+    assert by_units.scenarios == ["both"] and "without an ego of the protocol: single" in by_units.problems[-1]
     assert len(pickle.loads(pickle.dumps(by_units))[0].ground_truth()) == 0
 
 
@@ -105,7 +106,7 @@ def test_a_run_has_the_protocol_by_which_it_was_scored(run):
     (folder / "metrics.json").write_text(json.dumps({"protocol": {**protocol, "ground_truth": near}}))
     assert len(v2vloc.read(folder)[0].ground_truth()) < len(alone[0].ground_truth())
     (folder / "detections.jsonl").write_text("{")
-    assert "scores beside" in v2vloc.read(folder).problems[0]
+    assert "detections.jsonl: " in v2vloc.read(folder).problems[0]
 
 
 def test_a_copy_opens_the_scene_again(run):

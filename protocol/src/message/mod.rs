@@ -110,8 +110,10 @@ fn check_pose(what: &'static str, pose: &Pose) -> Result<()> {
 /// Checks texts in metadata: names of stages and classes, problems. They reach the terminals of others.
 fn check_text(what: &'static str, text: &str) -> Result<()> {
     check_count(what, text.len(), MAX_MESSAGE_BYTES)?;
-    let control = text.chars().filter(|letter| letter.is_control());
-    check_count("control characters of a text", control.count(), 0)
+    match text.chars().find(|letter| letter.is_control()) {
+        Some(found) => Err(WireError::ControlCharacter { what, found }),
+        None => Ok(()),
+    }
 }
 
 fn wrong_body(expected: u64, body: &Body) -> WireError {

@@ -88,7 +88,8 @@ pub struct QueueConfig {
     pub drop: QueueDrop,
     /// True if a newer message of the same stream replaces one that waits, which counts as `link_queue`.
     pub keep_last: bool,
-    /// Messages of at most this many bytes do not wait behind larger ones, which they interrupt. They keep their own order.
+    /// Messages of at most this many bytes do not wait behind larger ones, which they interrupt. They keep their own
+    /// order.
     pub urgent_bytes: u64,
 }
 

@@ -24,8 +24,8 @@ pub struct Packet {
 }
 
 impl Packet {
-    /// Horizontal distance between two positions, metres. Infinite if one is unknown: losses by distance are those of the
-    /// last point then.
+    /// Horizontal distance between two positions, metres. Infinite if one is unknown: losses by distance are those of
+    /// the last point then.
     pub fn distance_m(positions_m: [Option<[f64; 3]>; 2]) -> f64 {
         match positions_m {
             [Some(one), Some(other)] => (one[0] - other[0]).hypot(one[1] - other[1]),

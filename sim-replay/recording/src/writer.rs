@@ -83,7 +83,7 @@ impl RecordingWriter<File> {
     /// A new file that `write` writes and finishes, and that has its name only then.
     ///
     /// # Errors
-    /// [`RecordingError::Io`] if the file exists already, or an unfinished one, of a run that was killed; those of `write`.
+    /// [`RecordingError::Io`] if the file exists already, or an unfinished one of a killed process; those of `write`.
     /// No part of the file is left then.
     pub(super) fn whole<T>(
         path: &Path,
@@ -95,8 +95,9 @@ impl RecordingWriter<File> {
         }
         let part = path.with_added_extension("unfinished");
         // Never over an older one: it may be the recording that is read, or one that another process writes.
-        let mut writer = Self::create(&part, options)?;
-        let named = write(&mut writer).and_then(|written| {
+        let file = File::create_new(&part).map_err(RecordingError::io(&part))?;
+        let named = Self::over(file, &part, options).and_then(|mut writer| {
+            let written = write(&mut writer)?;
             let named = fs::rename(&part, path).and_then(|()| atomic_file::sync_name(path));
             named.map_err(RecordingError::io(path)).map(|()| written)
         });
