@@ -52,7 +52,8 @@ impl PeerModels {
         (before.as_ref() != Some(&other)).then_some(other)
     }
 
-    /// What differs, with both values, if an agent's descriptor names another network.
+    /// The difference between the networks, with both values, of an agent whose descriptor names another network than the
+    /// ego's; `None` for the same network.
     pub(crate) fn other(&self, cav: &CavId) -> Option<&String> {
         self.others.get(cav)
     }

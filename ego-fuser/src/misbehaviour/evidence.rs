@@ -245,8 +245,8 @@ fn is_near_both(at: &Point2<f64>, sender: &Point2<f64>) -> bool {
     distances.all(|distance| (OWN_BODY_M..NEAR_M).contains(&distance))
 }
 
-/// Whether a box within a radius has the shape of this one, or may be another vehicle's as it is further away than
-/// [`SAME_M`]; `None` without one within the radius.
+/// True if a box within a radius has the heading and size of this one, or is farther away than [`SAME_M`] and so may be of
+/// another vehicle. `None` without a box within the radius.
 fn found_among(one: &Box3d, others: &[Box3d], radius_m: f64) -> Option<bool> {
     let away = others
         .iter()
@@ -390,12 +390,13 @@ mod tests {
     fn boxes_that_are_turned_or_scaled_count_against_their_sender_and_honest_differences_do_not() {
         let turned = |found: &mut Box3d| found.heading_rad += FRAC_PI_2;
         let small = |found: &mut Box3d| found.size_m = found.size_m.map(|size_m| 0.3 * size_m);
-        for lie in [
+        for evidence in [
             with_changed(WORLD[1], 9, turned),
             with_changed(WORLD[1], 9, small),
         ] {
-            assert_eq!((lie.matched, lie.misshapen, lie.contradicted), (0, 4, 0));
-            let (log_odds, reason) = lie.judgement().unwrap();
+            let counts = (evidence.matched, evidence.misshapen, evidence.contradicted);
+            assert_eq!(counts, (0, 4, 0));
+            let (log_odds, reason) = evidence.judgement().unwrap();
             assert!(log_odds < -3.0 && reason == MisbehaviourReason::GhostObjects);
         }
         let opposite = |found: &mut Box3d| {

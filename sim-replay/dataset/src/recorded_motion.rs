@@ -208,8 +208,8 @@ mod tests {
         }
     }
 
-    /// Problems of thirty frames at 10 m/s along x that turn to the right by 30 degrees/s, with this recorded motion; and
-    /// whether speed and yaw rate are used.
+    /// Problems of thirty frames at 10 m/s along x that turn to the right by 30 degrees/s, with this recorded motion. The
+    /// flags are true if its speed and its yaw rate are used.
     fn problems_of_turn(imu: &str) -> (Vec<String>, [bool; 2]) {
         let dir = tempfile::tempdir().unwrap();
         for frame in 0..30 {

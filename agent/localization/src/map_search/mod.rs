@@ -85,9 +85,9 @@ impl MapSearch {
         }))
     }
 
-    /// The registered pose with the largest agreement, the share of the sweep's planes that agree with the map; and
-    /// whether it stands out: false if another pose or one of chance fits nearly as well for so many planes, or the search was
-    /// cut short. `None` where no candidate can be registered.
+    /// The registered pose with the largest agreement, the share of the sweep's planes that agree with the map. The flag is
+    /// true if the pose is unambiguous: the agreement is significantly larger than that of any other pose and of a random
+    /// one, and the search was complete. `None` where no candidate can be registered.
     fn best_pose(&self, sweep: &SweepOnMap<'_>) -> Option<(IcpFit, f64, bool)> {
         let (ground, _) = sweep.level_planes();
         let below = LevelSums::of(&ground);

@@ -101,7 +101,7 @@ impl OpenedData {
         evenly_spread(&all, scenarios.unwrap_or(usize::MAX)).into_iter()
     }
 
-    /// Sentences about what there is less of than was asked for, see [`lacking`].
+    /// Sentences about numbers below the requested ones, see [`lacking`].
     pub fn lacking(&self, scenarios: Option<usize>, frames: Option<usize>) -> Vec<String> {
         lacking(&self.recorded, &self.scenarios, scenarios, frames)
     }

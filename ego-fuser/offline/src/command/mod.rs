@@ -91,7 +91,7 @@ impl DataSets {
     }
 
     /// The data sets as a protocol, or that of their layout, arranges them, with at most `frames` of each scenario. Notes
-    /// what there is less of than was asked for.
+    /// numbers below the requested ones.
     fn evaluated(
         &self,
         left_out: &mut LeftOut,

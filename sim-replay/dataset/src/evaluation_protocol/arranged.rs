@@ -1,4 +1,4 @@
-//! Scenarios as a protocol evaluates them, and what there is less of than was asked for.
+//! Scenarios as a protocol evaluates them: choice of the ego and agents, number of scenarios and frames.
 
 use std::collections::HashSet;
 use std::path::Path;
@@ -48,8 +48,8 @@ impl ProtocolConfig {
     }
 }
 
-/// Sentences about what there is less of than was asked for: scenarios with an ego of the protocol, scenarios, frames of
-/// the longest of them.
+/// Sentences about numbers below the requested ones: scenarios with an ego of the protocol, scenarios, frames of the
+/// longest scenario.
 pub fn lacking(
     recorded: &[Scenario],
     arranged: &[Scenario],

@@ -36,8 +36,7 @@ const SAME_M: f64 = 0.5;
 /// Ages of the points of an object, seconds: a LiDAR turns in up to a tenth of a second, and the object drives on until
 /// the sweep ends, to which its box belongs. The age at which the box holds most points counts.
 const AGES_S: [f64; 5] = [0.0, 0.025, 0.05, 0.075, 0.1];
-/// Share by which a trial holds more than the labels: on sound scenes all trials hold at least 0.06 less, and those that
-/// mend a fault 0.2 more.
+/// Share by which a better trial holds more than the labels, in the mean and in the median.
 const BETTER_BY: f64 = 0.15;
 /// Share of a trial from which it may be what the labels should be: those that mend a fault hold 0.83 and more.
 const SOUND_SHARE: f64 = 0.7;
